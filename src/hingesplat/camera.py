@@ -1,0 +1,61 @@
+"""A pinhole camera. OpenCV axes: x right, y down, z forward; pixel centres at +0.5."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Pinhole intrinsics (pixels) and pose.
+
+    ``T_world_camera`` is a rigid 4×4 float64 matrix that takes camera coordinates to world coordinates.
+    """
+
+    T_world_camera: np.ndarray
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    @property
+    def T_camera_world(self) -> np.ndarray:
+        """World to camera, 4×4."""
+        R, t = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R.T, -R.T @ t
+        return T
+
+    @property
+    def centre(self) -> np.ndarray:
+        """Optical centre in world coordinates, (3,)."""
+        return self.T_world_camera[:3, 3]
+
+    def scaled(self, width: int, height: int) -> "Camera":
+        """The same view at another image size; intrinsics follow."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
+        )
+
+    def cropped(self, x0: int, y0: int, width: int, height: int) -> "Camera":
+        """The sub-image whose top-left pixel is (x0, y0)."""
+        return replace(self, cx=self.cx - x0, cy=self.cy - y0, width=width, height=height)
+
+    def project(self, points_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Points (n, 3) to pixel coordinates (n, 2) and depths (n,); depth ≤ 0 lies behind the camera."""
+        T = self.T_camera_world
+        p = points_world @ T[:3, :3].T + T[:3, 3]
+        z = p[:, 2]
+        safe = np.where(np.abs(z) < 1e-9, 1e-9, z)
+        uv = np.stack([self.fx * p[:, 0] / safe + self.cx, self.fy * p[:, 1] / safe + self.cy], axis=1)
+        return uv, z
+
+    def rays(self) -> tuple[np.ndarray, np.ndarray]:
+        """Origin (3,) and unit directions (height, width, 3) of the pixel-centre rays, world frame."""
+        u, v = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
+        d = np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones_like(u)], axis=-1)
+        d = d @ self.T_world_camera[:3, :3].T
+        return self.centre, d / np.linalg.norm(d, axis=-1, keepdims=True)

@@ -1,0 +1,60 @@
+"""Rigid transforms as 4×4 matrices and quaternions wxyz; thin names over roma, whose own order is xyzw."""
+
+import roma
+import torch
+from torch import Tensor
+
+
+def wxyz_to_matrix(quats: Tensor) -> Tensor:
+    """Quaternions (..., 4) wxyz, of any non-zero length, to rotation matrices (..., 3, 3)."""
+    unit = torch.nn.functional.normalize(quats, dim=-1)
+    return roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(unit))
+
+
+def matrix_to_wxyz(R: Tensor) -> Tensor:
+    """Rotation matrices (..., 3, 3) to unit quaternions (..., 4) wxyz."""
+    return roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(R))
+
+
+def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
+    """Hamilton product a ⊗ b of wxyz quaternions (..., 4); rotates by b first, then by a."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        -1,
+    )
+
+
+def rotvec_to_matrix(rotvec: Tensor) -> Tensor:
+    """Axis times angle (..., 3) in radians to rotation matrices (..., 3, 3); smooth at zero."""
+    return roma.rotvec_to_rotmat(rotvec)
+
+
+def matrix_to_rotvec(R: Tensor) -> Tensor:
+    """Rotation matrices (..., 3, 3) to axis times angle (..., 3), angle in [0, π]."""
+    return roma.rotmat_to_rotvec(R)
+
+
+def from_Rt(R: Tensor, t: Tensor) -> Tensor:
+    """Rotation (..., 3, 3) and translation (..., 3) to a 4×4 transform."""
+    T = torch.zeros((*R.shape[:-2], 4, 4), dtype=R.dtype, device=R.device)
+    T[..., 3, 3] = 1
+    top = torch.cat([R, t[..., None]], -1)
+    return torch.cat([top, T[..., 3:, :]], -2)
+
+
+def inverse(T: Tensor) -> Tensor:
+    """Inverse of rigid transforms (..., 4, 4)."""
+    Rt = T[..., :3, :3].transpose(-1, -2)
+    return from_Rt(Rt, -(Rt @ T[..., :3, 3:])[..., 0])
+
+
+def apply(T_b_a: Tensor, points_a: Tensor) -> Tensor:
+    """Points (n, 3) in frame a to frame b; one transform (4, 4), or one a point (n, 4, 4)."""
+    return (T_b_a[..., :3, :3] @ points_a[..., None])[..., 0] + T_b_a[..., :3, 3]
