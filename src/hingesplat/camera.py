@@ -37,7 +37,13 @@ class Camera:
         """The same view at another image size; intrinsics follow."""
         sx, sy = width / self.width, height / self.height
         return replace(
-            self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
+            self,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=self.cx * sx,
+            cy=self.cy * sy,
+            width=width,
+            height=height,
         )
 
     def cropped(self, x0: int, y0: int, width: int, height: int) -> "Camera":

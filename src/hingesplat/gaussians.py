@@ -1,12 +1,16 @@
 """The second noun: 3D Gaussians, with what a twin needs to know of each."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
+import numpy as np
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from hingesplat import se3
 from hingesplat.errors import HingesplatError
 
 SH_C0 = 0.28209479177387814  # value of the constant spherical harmonic
@@ -72,11 +76,16 @@ class Gaussians:
         """Read what ``save`` wrote.
 
         Raises:
-            HingesplatError: the file is missing or lacks a tensor.
+            HingesplatError: the file is missing, broken or lacks a tensor.
         """
         if not path.is_file():
             raise HingesplatError(f"{path}: no such file; run the stage that writes it first")
-        tensors = load_file(str(path))
+        try:
+            tensors = load_file(str(path))
+        except SafetensorError as e:
+            raise HingesplatError(
+                f"{path}: not a readable safetensors file; run the stage that writes it again"
+            ) from e
         missing = [f.name for f in fields(Gaussians) if f.name not in tensors]
         if missing:
             raise HingesplatError(f"{path}: lacks {', '.join(missing)}; it was not written by this version")
@@ -86,3 +95,20 @@ class Gaussians:
 def concatenate(groups: list[Gaussians]) -> Gaussians:
     """All Gaussians of several groups in order; sh degrees must agree."""
     return Gaussians(**{f.name: torch.cat([getattr(g, f.name) for g in groups]) for f in fields(Gaussians)})
+
+
+def posed(gaussians: Gaussians, transforms: Mapping[int, np.ndarray]) -> Gaussians:
+    """Each part moved rigidly: ``{part id: 4×4}``, as ``Twin.transforms`` gives them; parts not named stay.
+
+    Centres and orientations move. Spherical harmonics above degree 0 keep their lobes in the world frame, so
+    view-dependent colour does not turn with the part.
+    """
+    means, quats = gaussians.means.clone(), gaussians.quats.clone()
+    for part_id, T in transforms.items():
+        rows = gaussians.part == part_id
+        if rows.any():
+            T_world_part = torch.as_tensor(T, dtype=torch.float64, device=means.device)
+            turn = se3.matrix_to_wxyz(T_world_part[:3, :3]).to(quats.dtype)
+            means[rows] = se3.apply(T_world_part.to(means.dtype), means[rows])
+            quats[rows] = se3.quat_multiply(turn.expand_as(quats[rows]), quats[rows])
+    return replace(gaussians, means=means, quats=quats)

@@ -64,7 +64,7 @@ class Joint:
         if self.type == "prismatic":
             T[:3, 3] = axis * value
         elif self.type == "revolute":
-            K = np.cross(np.eye(3), -axis)
+            K = np.cross(np.eye(3), axis)  # K v = axis × v
             R = np.eye(3) + np.sin(value) * K + (1 - np.cos(value)) * K @ K
             T[:3, :3], T[:3, 3] = R, np.asarray(self.pivot) - R @ np.asarray(self.pivot)
         return T

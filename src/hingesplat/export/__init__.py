@@ -1,0 +1,1 @@
+"""Writers: a ``Twin`` in, files out."""

@@ -1,0 +1,38 @@
+# Everything here sets itself up: git, make and Python 3.11 or later are all it asks for.
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+BIN := .venv/bin
+PIP_INSTALL := $(BIN)/python -m pip install -c constraints.txt
+
+.PHONY: demo test lint bench
+.DELETE_ON_ERROR:
+
+demo: .venv/stamp-run  ## make an object, photograph it in two states, rebuild it as a moving twin in demo/
+	$(BIN)/hingesplat demo --out demo
+
+test: .venv/stamp-dev
+	$(BIN)/python -m pytest
+
+lint: .venv/stamp-dev
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+bench: .venv/stamp-dev  ## measure, write benchmarks/results/, and set the table in README.md
+	$(BIN)/python benchmarks/run.py --readme README.md
+
+# torch first, by itself and pinned: a looser wish of another package must not pick a different build.
+.venv/stamp-torch: constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "hingesplat needs Python 3.11 or later")'
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --upgrade pip
+	$(PIP_INSTALL) torch
+	@touch $@
+
+.venv/stamp-run: .venv/stamp-torch pyproject.toml
+	$(PIP_INSTALL) -e .
+	@touch $@
+
+.venv/stamp-dev: .venv/stamp-torch pyproject.toml
+	$(PIP_INSTALL) -e '.[dev,sim]'
+	@touch $@ .venv/stamp-run

@@ -1,0 +1,293 @@
+"""Single-state Gaussians: the photographs of one state to G^t (method, section 1)."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from hingesplat.camera import Camera
+from hingesplat.capture import View, visual_hull
+from hingesplat.gaussians import SH_C0, Gaussians
+from hingesplat.losses.photometric import Target, photometric, psnr
+from hingesplat.optim import GaussianAdam, LearningRates, densify, morton_order
+from hingesplat.render import Rendering, render
+
+Report = Callable[..., None]
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """One state's Gaussians."""
+
+    steps: int = 1500
+    """Optimiser steps."""
+    start_gaussians: int = 4000
+    """Gaussians at the start, drawn from the visual hull's shell."""
+    max_gaussians: int = 10_000
+    """Cap on the number of Gaussians."""
+    densify_every: int = 100
+    """Steps between densifications."""
+    densify_until: float = 0.65
+    """Fraction of the run after which the set only shrinks."""
+    min_opacity: float = 0.02
+    """Gaussians fainter than this are pruned."""
+    ssim_weight: float = 0.2
+    """Weight of 1 − SSIM; the rest is L1 (paper: 0.2)."""
+    depth_variance_weight: float = 20.0
+    """Pulls the weight along each ray to one depth, so that Gaussians lie on a surface."""
+    flatten_weight: float = 0.5
+    """Shrinks each Gaussian's thinnest axis, so that it is a disc on that surface."""
+    max_sh_degree: int = 2
+    """Largest spherical-harmonic degree that may be chosen."""
+    sh_gain_db: float = 0.3
+    """Held-back views must improve by this much for a degree above 0."""
+    rates: LearningRates = field(default_factory=LearningRates)
+
+
+@dataclass(frozen=True)
+class TrainingView:
+    """A photograph ready for the loop: cropped to the object, over white, with its alpha as a fourth plane."""
+
+    camera: Camera
+    target: Target
+    image: Tensor
+    """(4, h, w): rgb over white, alpha."""
+
+
+def training_view(view: View, margin: int = 8) -> TrainingView:
+    """Crop to the mask's rectangle plus a margin: what lies outside is background in every render, too."""
+    alpha = view.rgba[..., 3]
+    height, width = alpha.shape
+    rows, columns = np.flatnonzero(alpha.max(1)), np.flatnonzero(alpha.max(0))
+    if len(rows) == 0:
+        rows, columns = np.array([0, height - 1]), np.array([0, width - 1])
+    x0, x1 = max(columns[0] - margin, 0), min(columns[-1] + margin + 1, width)
+    y0, y1 = max(rows[0] - margin, 0), min(rows[-1] + margin + 1, height)
+    rgba = torch.from_numpy(view.rgba[y0:y1, x0:x1].astype(np.float32) / 255).permute(2, 0, 1)
+    image = torch.cat([rgba[:3] * rgba[3:] + 1 - rgba[3:], rgba[3:]]).contiguous()
+    camera = view.camera.cropped(int(x0), int(y0), int(x1 - x0), int(y1 - y0))
+    return TrainingView(camera, Target.of(image), image)
+
+
+def four_planes(rendering: Rendering) -> Tensor:
+    """Rgb and alpha of a rendering as (4, h, w), to compare with ``TrainingView.image``."""
+    return torch.cat([rendering.rgb, rendering.alpha[None]])
+
+
+def depth_and_its_square(means: Tensor, camera: Camera) -> Tensor:
+    """(n, 1) squared depth of each centre: the extra channel from which ``depth_variance`` is made."""
+    row = torch.as_tensor(camera.T_camera_world[2], dtype=means.dtype)
+    return (means @ row[:3] + row[3]).square()[:, None]
+
+
+def depth_variance(rendering: Rendering) -> Tensor:
+    """Mean over covered pixels of the variance of depth along the ray, scene units squared."""
+    alpha = rendering.alpha.clamp_min(1e-3)
+    mean = rendering.depth / alpha
+    variance = (rendering.channels[0] / alpha - mean.square()).clamp_min(0)
+    return (variance * (rendering.alpha > 0.5)).mean()
+
+
+def start_from_points(points: np.ndarray, spacing: float, generator: torch.Generator) -> Gaussians:
+    """Grey, half-opaque balls on points (n, 3), each as wide as the distance to its neighbours."""
+    n = len(points)
+    distance = cKDTree(points).query(points, min(4, n))[0][:, 1:].mean(1) if n > 1 else np.full(n, spacing)
+    means = torch.from_numpy(points.astype(np.float32))
+    log_scales = torch.from_numpy(np.log(np.maximum(distance, 1e-4) * 0.8).astype(np.float32))
+    return Gaussians(
+        means=means,
+        quats=torch.randn((n, 4), generator=generator),
+        log_scales=log_scales[:, None].repeat(1, 3),
+        logit_opacities=torch.zeros(n),
+        sh=torch.zeros((n, 1, 3)),
+        part=torch.zeros(n, dtype=torch.int64),
+    )
+
+
+def hull_shell(views: Sequence[View], n: int, rng: np.random.Generator) -> tuple[np.ndarray, float]:
+    """n points in the outer voxels of the visual hull, and the object's extent (longest side)."""
+    points, voxel = visual_hull(views, 96)
+    extent = float((points.max(0) - points.min(0)).max())
+    neighbours = cKDTree(points).query_ball_point(points, 2.5 * voxel, return_length=True)
+    weight = np.where(neighbours < 0.85 * neighbours.max(), 1.0, 0.15)
+    chosen = rng.choice(len(points), n, replace=len(points) < n, p=weight / weight.sum())
+    return points[chosen] + rng.uniform(-0.5, 0.5, (n, 3)) * voxel, extent
+
+
+@torch.no_grad()
+def seen_weight(gaussians: Gaussians, cameras: Sequence[Camera]) -> Tensor:
+    """(n,) largest blending weight, summed over a picture's pixels, that each Gaussian has in any camera.
+
+    The gradient of a picture's sum with respect to a per-Gaussian channel of ones is that Gaussian's weight.
+    """
+    best = torch.zeros(len(gaussians))
+    for camera in cameras:
+        with torch.enable_grad():
+            ones = torch.ones((len(gaussians), 1), requires_grad=True)
+            (weight,) = torch.autograd.grad(render(gaussians, camera, channels=ones).channels.sum(), ones)
+        best = torch.maximum(best, weight[:, 0])
+    return best
+
+
+def fit(
+    views: Sequence[View],
+    config: FitConfig,
+    *,
+    seed: int = 0,
+    points: np.ndarray | None = None,
+    report: Report = lambda **_: None,
+) -> Gaussians:
+    """Photographs of one state to Gaussians on its surface.
+
+    Args:
+        views: posed photographs with masks.
+        points: (n, 3) start instead of the visual hull, world frame.
+        report: called now and then with ``step, steps, loss, psnr, gaussians``.
+
+    Returns:
+        Gaussians of the chosen spherical-harmonic degree, all of part 0, each seen from at least one view.
+    """
+    rng = np.random.default_rng(seed)
+    generator = torch.Generator().manual_seed(seed)
+    if points is None:
+        points, extent = hull_shell(views, config.start_gaussians, rng)
+    else:
+        extent = float((points.max(0) - points.min(0)).max())
+    training = [training_view(v) for v in views]
+    held_back = training[:: max(len(training) // 4, 2)][:4] if len(training) >= 12 else []
+    kept = [v for v in training if not any(v is h for h in held_back)]
+    start = start_from_points(points, extent / 64, generator)
+    optimiser = GaussianAdam(start[morton_order(start.means)], config.rates, extent)
+    _optimise(optimiser, kept, config, extent, rng, generator, report)
+    _prune_unseen(optimiser, training)
+    return _choose_sh_degree(optimiser, kept, held_back, config, extent, rng, report)
+
+
+def _optimise(
+    optimiser: GaussianAdam,
+    training: Sequence[TrainingView],
+    config: FitConfig,
+    extent: float,
+    rng: np.random.Generator,
+    generator: torch.Generator,
+    report: Report,
+) -> None:
+    white = torch.ones(3)
+    statistics = torch.zeros((len(optimiser), 3))
+    order: list[int] = []
+    for step in range(config.steps):
+        progress = step / config.steps
+        order = order or list(rng.permutation(len(training)))
+        view = training[order.pop()]
+        loss, image = _view_loss(optimiser, view, config, extent, progress, white, statistics)
+        loss.backward()
+        optimiser.step(progress)
+        growing = step >= 200 and progress < config.densify_until
+        if growing and step % config.densify_every == 0:
+            _densify(optimiser, statistics, config, extent, generator, view.camera.width)
+            statistics = torch.zeros((len(optimiser), 3))
+        if growing and step % 500 == 0:
+            _prune_unseen(optimiser, training)
+            statistics = torch.zeros((len(optimiser), 3))
+        if step % 50 == 0 or step == config.steps - 1:
+            report(
+                step=step + 1,
+                steps=config.steps,
+                loss=float(loss),
+                psnr=float(psnr(image.detach()[:3], view.image[:3])),
+                gaussians=len(optimiser),
+            )
+
+
+def _view_loss(
+    optimiser: GaussianAdam,
+    view: TrainingView,
+    config: FitConfig,
+    extent: float,
+    progress: float,
+    white: Tensor,
+    statistics: Tensor | None,
+) -> tuple[Tensor, Tensor]:
+    g = optimiser.gaussians
+    regular = progress > 0.2 and config.depth_variance_weight > 0
+    channels = depth_and_its_square(g.means, view.camera) if regular else None
+    r = render(g, view.camera, background=white, channels=channels, screen_gradient=statistics)
+    image = four_planes(r)
+    loss = photometric(image, view.target, config.ssim_weight)
+    if regular:
+        loss = loss + config.depth_variance_weight * depth_variance(r) / extent**2
+        loss = loss + config.flatten_weight * g.scales.amin(1).mean() / extent
+    return loss, image
+
+
+def _densify(
+    optimiser: GaussianAdam,
+    statistics: Tensor,
+    config: FitConfig,
+    extent: float,
+    generator: torch.Generator,
+    width: int,
+) -> None:
+    gradient = statistics[:, 0] / statistics[:, 1].clamp_min(1)
+    solid = optimiser.gaussians.opacities.detach() > config.min_opacity
+    room = config.max_gaussians - int(solid.sum())
+    optimiser.select(solid)
+    gradient = gradient[solid]
+    n_hot = min(max(room, 0), int((gradient > 0).sum()), len(optimiser) // 4)
+    hot = gradient.topk(n_hot).indices if n_hot > 0 else torch.zeros(0, dtype=torch.int64)
+    densify(optimiser, hot, 0.02 * extent, generator)
+    optimiser.select(morton_order(optimiser.gaussians.means.detach()))
+
+
+def _prune_unseen(optimiser: GaussianAdam, training: Sequence[TrainingView]) -> None:
+    seen = seen_weight(optimiser.gaussians.detached(), [v.camera for v in training])
+    optimiser.select(seen > 0.5)
+
+
+def _choose_sh_degree(
+    optimiser: GaussianAdam,
+    training: Sequence[TrainingView],
+    held_back: Sequence[TrainingView],
+    config: FitConfig,
+    extent: float,
+    rng: np.random.Generator,
+    report: Report,
+) -> Gaussians:
+    """Refine with each degree in turn; keep the smallest that held-back views do not improve on by much."""
+    steps = config.steps // 6
+    base = optimiser.gaussians.detached()
+    best, best_psnr = base, -math.inf
+    for degree in range(config.max_sh_degree + 1) if held_back else [0]:
+        padding = torch.zeros((len(base), (degree + 1) ** 2 - 1, 3))
+        start = replace(base, sh=torch.cat([base.sh, padding], 1))
+        trial = GaussianAdam(start, config.rates, extent)
+        order: list[int] = []
+        for step in range(steps):
+            order = order or list(rng.permutation(len(training)))
+            loss, _ = _view_loss(
+                trial, training[order.pop()], config, extent, 0.6 + 0.4 * step / steps, torch.ones(3), None
+            )
+            loss.backward()
+            trial.step(0.6 + 0.4 * step / steps)
+        fitted = trial.gaussians.detached()
+        score = mean_psnr(fitted, held_back or training)
+        report(step=steps, steps=steps, loss=float(loss), psnr=score, gaussians=len(fitted))
+        if score < best_psnr + (config.sh_gain_db if degree else 0):
+            break
+        best, best_psnr = fitted, score
+    return best
+
+
+@torch.no_grad()
+def mean_psnr(gaussians: Gaussians, views: Sequence[TrainingView]) -> float:
+    """Mean PSNR over views, white background, on the cropped pictures."""
+    white = torch.ones(3)
+    scores = [float(psnr(render(gaussians, v.camera, background=white).rgb, v.image[:3])) for v in views]
+    return float(np.mean(scores))
+
+
+__all__ = ["SH_C0", "FitConfig", "TrainingView", "fit", "mean_psnr", "seen_weight", "training_view"]

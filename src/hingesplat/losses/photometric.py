@@ -1,0 +1,348 @@
+"""The photometric loss of 3D Gaussian Splatting, (1 - w)·L1 + w·(1 - SSIM), and the measures of image quality.
+
+SSIM after Wang et al. 2004: an 11×11 Gaussian window with σ = 1.5, zero padding, data range 1, per channel. On the
+CPU a fused kernel computes loss and gradient at once, some fifteen times faster than convolutions in torch.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numba import njit
+from torch import Tensor
+
+from hingesplat.simd import (
+    INLINE,
+    INNER,
+    KERNEL,
+    LANES,
+    Build,
+    parallel,
+    sload,
+    sstore,
+    vfma,
+    vgt,
+    viota,
+    vload,
+    vmax,
+    vselect,
+    vsplat,
+    vstore,
+    vsum,
+)
+
+WINDOW_SIGMA = 1.5
+RADIUS = 5
+"""Half width of the window: 11 pixels in all."""
+C1, C2 = 0.01**2, 0.03**2
+"""The constants that stabilise SSIM, for a data range of 1."""
+
+_WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / WINDOW_SIGMA) ** 2)
+_WINDOW /= _WINDOW.sum()
+
+
+@dataclass(frozen=True)
+class Target:
+    """A photograph to be matched, with what the loss needs of it more than once."""
+
+    image: Tensor
+    """(C, height, width), values in 0 … 1."""
+    mean: Tensor
+    """(C, height, width) local mean."""
+    variance: Tensor
+    """(C, height, width) local variance."""
+
+    @staticmethod
+    def of(image: Tensor) -> "Target":
+        """Blur ``image`` (C, height, width) once for all."""
+        exact = image.detach().double()
+        mean = _blur(exact)
+        variance = _blur(exact * exact) - mean * mean
+        return Target(image.detach().contiguous(), mean.to(image), variance.to(image))
+
+
+def photometric(image: Tensor, target: Target, ssim_weight: float = 0.2) -> Tensor:
+    """(1 - w)·mean |image - target| + w·(1 - mean SSIM), a scalar; differentiable in ``image`` (C, height, width).
+
+    Raises:
+        ValueError: the shapes differ.
+    """
+    if image.shape != target.image.shape:
+        raise ValueError(f"image: shape {tuple(image.shape)}, but its target has {tuple(target.image.shape)}")
+    if image.device.type == "cpu" and image.dtype == torch.float32 and image.numel():
+        return _Fused.apply(image, target, ssim_weight)
+    l1 = (image - target.image).abs().mean()
+    return (1 - ssim_weight) * l1 + ssim_weight * (1 - _ssim_map(image, target).mean())
+
+
+def ssim(a: Tensor, b: Tensor) -> Tensor:
+    """Mean structural similarity of two images (C, height, width): 1 when they are equal."""
+    return _ssim_map(a, Target.of(b)).mean()
+
+
+def psnr(a: Tensor, b: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Peak signal-to-noise ratio in dB of images (C, height, width) with data range 1.
+
+    ``mask`` (height, width), bool or weights, selects the pixels that count. Equal images give infinity.
+    """
+    error = (a - b) ** 2
+    if mask is None:
+        return -10 * torch.log10(error.mean())
+    weight = mask.to(error)
+    return -10 * torch.log10((error * weight).sum() / (weight.sum() * len(error)))
+
+
+def _blur(image: Tensor) -> Tensor:
+    """Window average of every channel. A full 2-D window: torch is many times slower with two 1-D ones."""
+    window = torch.as_tensor(_WINDOW).to(image)
+    kernel = (window[:, None] * window).expand(len(image), 1, -1, -1)
+    return torch.nn.functional.conv2d(image[None], kernel, padding=RADIUS, groups=len(image))[0]
+
+
+def _ssim_map(x: Tensor, target: Target) -> Tensor:
+    mean = _blur(x)
+    variance = _blur(x * x) - mean * mean
+    covariance = _blur(x * target.image) - mean * target.mean
+    above = (2 * mean * target.mean + C1) * (2 * covariance + C2)
+    below = (mean * mean + target.mean**2 + C1) * (variance + target.variance + C2)
+    return above / below
+
+
+# ---- the fused kernel ------------------------------------------------------------------------------------
+#
+# With μ, e, f the window averages of x, x², x·y, SSIM is a function of (μ, e - μ², f - μ·μ_y) at every pixel. Rows
+# stream through three steps: average along the row; average down the columns and differentiate SSIM; average these
+# derivatives likewise (the window is its own transpose) and add up the gradient. Every step lags the one before by
+# five rows.
+
+_BUILD = Build([Path(__file__)])
+_W0, _W1, _W2, _W3, _W4, _W5 = (np.float32(w) for w in _WINDOW[RADIUS:])
+_C1, _C2 = np.float32(C1), np.float32(C2)
+_0, _1, _2 = np.float32(0), np.float32(1), np.float32(2)
+_MARGIN = 16  # zero columns beside a padded row
+_STEP = 16  # rows that go through each step at a time
+_LAG = 2 * RADIUS
+
+
+@njit(**INLINE)
+def _load(array, p, count, scratch):
+    """array[p : p + count], zeros up to a whole vector."""
+    if count >= LANES:
+        return vload(array, p)
+    vstore(scratch, 0, vsplat(_0))
+    for k in range(count):
+        sstore(scratch, k, sload(array, p + k))
+    return vload(scratch, 0)
+
+
+@njit(**INLINE)
+def _store(array, p, count, value, scratch):
+    """array[p : p + count] = the first ``count`` lanes."""
+    if count >= LANES:
+        vstore(array, p, value)
+    else:
+        vstore(scratch, 0, value)
+        for k in range(count):
+            sstore(array, p + k, sload(scratch, k))
+
+
+@njit(**INLINE)
+def _average(array, p, stride):
+    """Window average of the vectors at p - 5·stride … p + 5·stride."""
+    far = (vload(array, p - 5 * stride) + vload(array, p + 5 * stride)) * _W5
+    far = vfma(vload(array, p - 4 * stride) + vload(array, p + 4 * stride), _W4, far)
+    far = vfma(vload(array, p - 3 * stride) + vload(array, p + 3 * stride), _W3, far)
+    far = vfma(vload(array, p - 2 * stride) + vload(array, p + 2 * stride), _W2, far)
+    far = vfma(vload(array, p - stride) + vload(array, p + stride), _W1, far)
+    return vfma(vload(array, p), _W0, far)
+
+
+@njit(**INLINE)
+def _average_rows(rows, padded, planes, plane, q, width):
+    """Average the three padded rows along themselves, into row q of the three planes."""
+    for k in range(3):
+        for c in range(0, width, LANES):
+            vstore(planes, k * plane + q + c, _average(rows, k * padded + _MARGIN + c, 1))
+
+
+@njit(**INNER)
+def _average_source(x, y, p, width, rows, padded, planes, plane, q, scratch):
+    for c in range(0, width, LANES):
+        a, b = _load(x, p + c, width - c, scratch), _load(y, p + c, width - c, scratch)
+        vstore(rows, _MARGIN + c, a)
+        vstore(rows, padded + _MARGIN + c, a * a)
+        vstore(rows, 2 * padded + _MARGIN + c, a * b)
+    _average_rows(rows, padded, planes, plane, q, width)
+
+
+@njit(**INNER)
+def _differentiate(averages, plane, q, pitch, mean, variance, p, width, rows, padded, planes, q_out, scratch):
+    """d SSIM / d (μ, e, f) of one row, averaged along it; returns the row's sum of SSIM."""
+    total, lane = vsplat(_0), viota()
+    for c in range(0, width, LANES):
+        mx = _average(averages, q + c, pitch)
+        vx = _average(averages, plane + q + c, pitch) - mx * mx
+        my, vy = _load(mean, p + c, width - c, scratch), _load(variance, p + c, width - c, scratch)
+        cov = _average(averages, 2 * plane + q + c, pitch) - mx * my
+        a, b = vfma(_2 * mx, my, _C1), vfma(cov, _2, _C2)
+        g, h = vfma(mx, mx, vfma(my, my, _C1)), vx + vy + _C2
+        inverse = _1 / (g * h)
+        value = a * b * inverse
+        d_f, d_e = _2 * a * inverse, _0 - value * (g * inverse)
+        d_mu = _2 * (my * (b * inverse) - mx * value * (h * inverse)) - _2 * mx * d_e - my * d_f
+        inside = vgt(np.float32(width - c), lane)
+        total = total + vselect(inside, value, _0)
+        vstore(rows, _MARGIN + c, vselect(inside, d_mu, _0))
+        vstore(rows, padded + _MARGIN + c, vselect(inside, d_e, _0))
+        vstore(rows, 2 * padded + _MARGIN + c, vselect(inside, d_f, _0))
+    _average_rows(rows, padded, planes, plane, q_out, width)
+    return vsum(total)
+
+
+@njit(**INNER)
+def _finish(derivatives, plane, q, pitch, x, y, p, width, gradient, l1_scale, ssim_scale, scratch):
+    """The gradient of one row; returns the row's sum of |x - y|."""
+    total = vsplat(_0)
+    for c in range(0, width, LANES):
+        a, b = _load(x, p + c, width - c, scratch), _load(y, p + c, width - c, scratch)
+        d = a - b
+        total = total + vmax(d, _0 - d)
+        sign = vselect(vgt(d, _0), l1_scale, vselect(vgt(_0, d), -l1_scale, _0))
+        d_mu, d_e = _average(derivatives, q + c, pitch), _average(derivatives, plane + q + c, pitch)
+        d_f = _average(derivatives, 2 * plane + q + c, pitch)
+        g = vfma(_2 * a, d_e, vfma(b, d_f, d_mu))
+        _store(gradient, p + c, width - c, vfma(g, ssim_scale, sign), scratch)
+    return vsum(total)
+
+
+@njit(**INNER)
+def _keep_last(planes, plane, pitch):
+    """Move the last rows of the three planes to their top."""
+    for k in range(3):
+        for q in range(k * plane, k * plane + _LAG * pitch, LANES):
+            vstore(planes, q, vload(planes, q + _STEP * pitch))
+
+
+@njit(**INNER)
+def _stream(
+    x,
+    y,
+    mean,
+    variance,
+    base,
+    first,
+    last,
+    height,
+    width,
+    gradient,
+    l1_scale,
+    ssim_scale,
+    pitch,
+    work,
+    scratch,
+):
+    """Rows first … last - 1 of the image plane at ``base``; returns the sums of SSIM and of |x - y|."""
+    rows, averages, derivatives = work
+    padded, plane = pitch + 2 * _MARGIN, (_STEP + _LAG) * pitch
+    zero = vsplat(_0)
+    similarity, difference = 0.0, 0.0
+    for start in range(first - _LAG, last + _LAG, _STEP):
+        for i in range(_STEP):
+            r, q = start + i, (_LAG + i) * pitch
+            if 0 <= r < height:
+                p = base + r * width
+                _average_source(x, y, p, width, rows, padded, averages, plane, q, scratch)
+            else:
+                for k in range(3):
+                    for c in range(0, pitch, LANES):
+                        vstore(averages, k * plane + q + c, zero)
+        for i in range(_STEP):
+            r, q = start - RADIUS + i, (RADIUS + i) * pitch
+            if 0 <= r < height:
+                p, q_out = base + r * width, (_LAG + i) * pitch
+                value = _differentiate(
+                    averages,
+                    plane,
+                    q,
+                    pitch,
+                    mean,
+                    variance,
+                    p,
+                    width,
+                    rows,
+                    padded,
+                    derivatives,
+                    q_out,
+                    scratch,
+                )
+                if first <= r < last:
+                    similarity += value
+            else:
+                for k in range(3):
+                    for c in range(0, pitch, LANES):
+                        vstore(derivatives, k * plane + (_LAG + i) * pitch + c, zero)
+        for i in range(_STEP):
+            r, q = start - _LAG + i, (RADIUS + i) * pitch
+            if first <= r < last:
+                p = base + r * width
+                difference += _finish(
+                    derivatives, plane, q, pitch, x, y, p, width, gradient, l1_scale, ssim_scale, scratch
+                )
+        _keep_last(averages, plane, pitch)
+        _keep_last(derivatives, plane, pitch)
+    return similarity, difference
+
+
+@njit(**KERNEL)
+def _loss_and_gradient(build, x, y, mean, variance, size, weight, sums, gradient, t, threads):
+    """Every channel is cut into as many bands as there are threads; thread t does every so many-th of them."""
+    channels, height, width = size
+    n = channels * height * width
+    l1_scale, ssim_scale = np.float32((1 - weight) / n), np.float32(-weight / n)
+    pitch = (width + LANES - 1) // LANES * LANES
+    scratch, rows = np.empty(LANES, np.float32), np.zeros(3 * (pitch + 2 * _MARGIN), np.float32)
+    plane = (_STEP + _LAG) * pitch
+    work = (rows, np.zeros(3 * plane, np.float32), np.zeros(3 * plane, np.float32))
+    for job in range(t, channels * threads, threads):
+        channel, band = job // threads, job % threads
+        first, last = band * height // threads, (band + 1) * height // threads
+        base = channel * height * width
+        similarity, difference = _stream(
+            x,
+            y,
+            mean,
+            variance,
+            base,
+            first,
+            last,
+            height,
+            width,
+            gradient,
+            l1_scale,
+            ssim_scale,
+            pitch,
+            work,
+            scratch,
+        )
+        sums[t, 0] += similarity
+        sums[t, 1] += difference
+
+
+class _Fused(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, image, target, weight):
+        size, threads = tuple(image.shape), torch.get_num_threads()
+        gradient, sums = np.empty(image.numel(), np.float32), np.zeros((threads, 2))
+        planes = (image.detach(), target.image, target.mean, target.variance)
+        flat = (t.contiguous().numpy().reshape(-1) for t in planes)
+        parallel(_loss_and_gradient, threads, _BUILD, *flat, size, float(weight), sums, gradient)
+        similarity, difference = sums.sum(axis=0) / image.numel()
+        ctx.save_for_backward(torch.from_numpy(gradient.reshape(size)))
+        return image.new_tensor((1 - weight) * difference + weight * (1 - similarity))
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, g):
+        (gradient,) = ctx.saved_tensors
+        return gradient * g, None, None

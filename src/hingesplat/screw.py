@@ -1,0 +1,167 @@
+"""Rigid motion ↔ screw: turn by an angle about an axis through a pivot, slide along the same axis.
+
+Right-handed about the axis, radians, scene units. Numpy float64; the two ``_torch`` functions are the same
+joints for optimisers. Chasles' theorem: every rigid motion is one such screw, up to the sign of its axis.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Shaped
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+STRAIGHT = 1e-9
+"""Radians. Below it a motion counts as a pure slide: the rounding of a matrix alone turns by 1e-16."""
+PARALLEL = 1e-6
+"""Sine of the angle between two lines below which they count as parallel (the value that the field uses)."""
+
+
+@dataclass(frozen=True)
+class Screw:
+    """A rigid motion as rotation about, and translation along, one line."""
+
+    axis: np.ndarray
+    """(3,) unit direction of the line."""
+    pivot: np.ndarray
+    """(3,) a point on the line."""
+    angle: float
+    """Radians, right-handed about ``axis``."""
+    slide: float
+    """Scene units along ``axis``."""
+
+
+def screw_to_matrix(screw: Screw) -> Float[np.ndarray, "4 4"]:
+    """The motion ``T_b_a`` (4, 4) that a screw stands for."""
+    a, c = screw.axis, screw.pivot
+    K = _cross_matrix(a)
+    # R − I, with 1 − cos θ = 2 sin²(θ/2), so that far pivots of small angles lose no digits.
+    turn = np.sin(screw.angle) * K + 2 * np.sin(screw.angle / 2) ** 2 * (K @ K)
+    T = np.eye(4)
+    T[:3, :3] += turn
+    T[:3, 3] = screw.slide * a - turn @ c
+    return T
+
+
+def matrix_to_screw(T_b_a: Float[np.ndarray, "4 4"], near: ArrayLike = (0.0, 0.0, 0.0)) -> Screw:
+    """The screw of a rigid motion (4, 4): angle in [0, π], the pivot nearest to the point ``near`` (3,).
+
+    A pure slide has angle 0, slide ≥ 0 and pivot ``near``; the identity has axis z. Any angle is safe: the
+    axis comes from the quaternion, which is well conditioned at π as well as near 0. The pivot of a small
+    angle lies far off and is known only to about (error of t) / angle.
+    """
+    t, near_point = np.asarray(T_b_a[:3, 3], float), np.asarray(near, float)
+    rotvec = Rotation.from_matrix(np.asarray(T_b_a[:3, :3], float)).as_rotvec()
+    angle = float(np.linalg.norm(rotvec))
+    if angle < STRAIGHT:
+        slide = float(np.linalg.norm(t))
+        return Screw(t / slide if slide > 0 else np.array([0.0, 0.0, 1.0]), near_point, 0.0, slide)
+    a = rotvec / angle
+    slide = float(a @ t)
+    across = t - slide * a
+    on_axis = (across + np.cross(a, across) / np.tan(angle / 2)) / 2
+    return Screw(a, on_axis + a * (a @ (near_point - on_axis)), angle, slide)
+
+
+def revolute(axis: ArrayLike, pivot: ArrayLike, angle: float) -> Float[np.ndarray, "4 4"]:
+    """Turn (4, 4) by ``angle`` radians about the line through ``pivot`` along ``axis``, of any length but 0.
+
+    Raises:
+        ValueError: the axis has no length.
+    """
+    return screw_to_matrix(Screw(_unit(axis), np.asarray(pivot, float), angle, 0.0))
+
+
+def prismatic(axis: ArrayLike, slide: float) -> Float[np.ndarray, "4 4"]:
+    """Move (4, 4) by ``slide`` units along ``axis`` of any non-zero length.
+
+    Raises:
+        ValueError: the axis has no length.
+    """
+    return screw_to_matrix(Screw(_unit(axis), np.zeros(3), 0.0, slide))
+
+
+def revolute_torch(
+    axis: Float[Tensor, "*batch 3"], pivot: Float[Tensor, "*batch 3"], angle: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch 4 4"]:
+    """``revolute`` with gradients to all three; smooth at every angle. The axis is normalised here."""
+    a = torch.nn.functional.normalize(axis, dim=-1)
+    zero = torch.zeros_like(a[..., 0])
+    x, y, z = a.unbind(-1)
+    K = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    turn = angle.sin()[..., None, None] * K + 2 * (angle / 2).sin().square()[..., None, None] * (K @ K)
+    return _from_turn(turn, -(turn @ pivot[..., None])[..., 0])
+
+
+def prismatic_torch(
+    axis: Float[Tensor, "*batch 3"], slide: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch 4 4"]:
+    """``prismatic`` with gradients to both. The axis is normalised here."""
+    t = torch.nn.functional.normalize(axis, dim=-1) * slide[..., None]
+    return _from_turn(torch.zeros_like(t)[..., None].expand(*t.shape, 3), t)
+
+
+def fit_rigid(
+    points_a: Shaped[np.ndarray, "*batch n 3"],
+    points_b: Shaped[np.ndarray, "*batch n 3"],
+    weights: Shaped[np.ndarray, "*batch n"] | None = None,
+) -> Float[np.ndarray, "*batch 4 4"]:
+    """The rigid ``T_b_a`` (..., 4, 4) of least Σ w ‖T_b_a a − b‖² over paired points (..., n, 3).
+
+    Kabsch (1976) with weights, never a reflection. With fewer than three points off one line the rotation is
+    one of many that fit equally well.
+
+    Raises:
+        ValueError: the weights of a problem sum to nothing.
+    """
+    a, b = np.asarray(points_a, float), np.asarray(points_b, float)
+    w = np.ones(a.shape[:-1]) if weights is None else np.asarray(weights, float)
+    total = w.sum(-1, keepdims=True)
+    if not np.all(total > 0):
+        raise ValueError("fit_rigid: the weights must have a positive sum")
+    w = (w / total)[..., None]
+    centre_a, centre_b = (w * a).sum(-2, keepdims=True), (w * b).sum(-2, keepdims=True)
+    covariance = np.swapaxes(w * (b - centre_b), -1, -2) @ (a - centre_a)
+    U, _, Vt = np.linalg.svd(covariance)
+    U[..., :, 2] *= np.linalg.det(U @ Vt)[..., None]
+    R = U @ Vt
+    T = np.zeros((*a.shape[:-2], 4, 4))
+    T[..., :3, :3], T[..., 3, 3] = R, 1
+    T[..., :3, 3] = centre_b[..., 0, :] - (R @ np.swapaxes(centre_a, -1, -2))[..., 0]
+    return T
+
+
+def line_distance(p: ArrayLike, d: ArrayLike, q: ArrayLike, e: ArrayLike) -> float:
+    """Shortest distance of the lines p + s·d and q + u·e, all (3,); point to line when they are parallel.
+
+    Raises:
+        ValueError: a direction has no length.
+    """
+    d_unit, e_unit = _unit(d), _unit(e)
+    between = np.asarray(q, float) - np.asarray(p, float)
+    normal = np.cross(d_unit, e_unit)
+    length = np.linalg.norm(normal)
+    if length < PARALLEL:
+        return float(np.linalg.norm(np.cross(between, d_unit)))
+    return float(abs(between @ normal) / length)
+
+
+def _unit(axis: ArrayLike) -> np.ndarray:
+    a = np.asarray(axis, float)
+    length = np.linalg.norm(a)
+    if not length > 0:
+        raise ValueError(f"axis {a.tolist()} has no direction")
+    return a / length
+
+
+def _cross_matrix(a: np.ndarray) -> np.ndarray:
+    return np.cross(np.eye(3), a)  # K v = a × v
+
+
+def _from_turn(turn: Tensor, t: Tensor) -> Tensor:
+    """(..., 3, 3) R − I and (..., 3) translation to (..., 4, 4)."""
+    top = torch.cat([turn, t[..., None]], -1)
+    step = torch.cat([top, torch.zeros_like(top[..., :1, :])], -2)
+    return torch.eye(4, dtype=t.dtype, device=t.device) + step

@@ -1,0 +1,272 @@
+"""Every 1-DoF motion on a grid, tried: where could these seeds have gone in the other state?
+
+A joint is a line and a number. For each axis direction and angle (or slide) the kernel moves the seeds and adds up a
+score volume of the other state (high on surfaces that were not there before, negative in free space), over all axis
+positions that cross the object. Nothing is matched by appearance alone, so repeating texture cannot mislead it far.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit, prange
+from scipy.ndimage import distance_transform_edt
+
+from hingesplat.screw import prismatic, revolute
+from hingesplat.visibility import FREE, SURFACE, Sight, ask
+
+
+COLOUR_SCALE = 0.2
+"""RGB difference at which a surface of another colour counts half."""
+
+
+@dataclass(frozen=True)
+class ScoreVolume:
+    """A voxel grid over the object: how welcome a moved point is, and in which colour."""
+
+    origin: np.ndarray
+    """(3,) world position of the centre of voxel (0, 0, 0)."""
+    voxel: float
+    score: np.ndarray
+    """(x, y, z) float32 in [-1, 1]."""
+    colour: np.ndarray
+    """(x, y, z, 3) float32."""
+
+
+def score_volume(
+    points: np.ndarray, colours: np.ndarray, here: Sight, other: Sight, low: np.ndarray, high: np.ndarray, cells: int
+) -> ScoreVolume:
+    """Score volume of the state seen by ``here``, whose surface is sampled by points (n, 3) with colours (n, 3).
+
+    A surface voxel is worth 1 where the other state saw free space, 0.6 where the other state could not see,
+    and 0.15 where it saw a surface, too; free space costs −1.
+    """
+    voxel = float((high - low).max()) / cells
+    shape = np.ceil((high - low) / voxel).astype(int) + 1
+    centres = np.stack(np.meshgrid(*[np.arange(s) for s in shape], indexing="ij"), -1).reshape(-1, 3)
+    centres = centres * voxel + low
+    views_free = ask(centres, np.zeros_like(centres), here)[:, FREE].reshape(shape)
+    index = np.clip(np.round((points - low) / voxel).astype(int), 0, shape - 1)
+    novelty_of_point = novelty(ask(points, colours, other))
+    occupied = np.zeros(shape, np.float32)
+    np.maximum.at(occupied, tuple(index.T), novelty_of_point)
+    colour = np.zeros((*shape, 3), np.float32)
+    count = np.zeros(shape, np.float32)
+    np.add.at(colour, tuple(index.T), colours)
+    np.add.at(count, tuple(index.T), 1)
+    colour /= np.maximum(count, 1)[..., None]
+    distance, nearest = distance_transform_edt(count == 0, return_indices=True)
+    near = tuple(nearest)
+    score = occupied[near] * np.exp(-0.5 * np.maximum(distance - 0.5, 0) ** 2)
+    score = np.where((views_free >= 3) & (distance > 1.5), -1.0, score)
+    return ScoreVolume(low, voxel, score.astype(np.float32), np.ascontiguousarray(colour[near]))
+
+
+def novelty(answer: np.ndarray) -> np.ndarray:
+    """(n,) how new a surface point is, from what the other state's cameras say of it."""
+    new = answer[:, FREE] >= 3
+    seen = answer[:, SURFACE] >= 2
+    return np.where(new, 1.0, np.where(seen, 0.15, 0.6)).astype(np.float32)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _sum(q, colours, shift, origin, inverse_voxel, score, volume_colour, give_up):  # pragma: no cover - compiled
+    """Mean score of points q + shift; surfaces count by how constant the colour difference is (shading may shift it)."""
+    nx, ny, nz = score.shape
+    m = q.shape[0]
+    zero = np.float32(0)
+    penalty, welcome, square = zero, zero, zero
+    mean0, mean1, mean2 = zero, zero, zero
+    for i in range(m):
+        x = int((q[i, 0] + shift[0] - origin[0]) * inverse_voxel + np.float32(0.5))
+        y = int((q[i, 1] + shift[1] - origin[1]) * inverse_voxel + np.float32(0.5))
+        z = int((q[i, 2] + shift[2] - origin[2]) * inverse_voxel + np.float32(0.5))
+        if x < 0 or y < 0 or z < 0 or x >= nx or y >= ny or z >= nz:
+            penalty -= 1
+        else:
+            s = score[x, y, z]
+            if s > 0:
+                e0 = volume_colour[x, y, z, 0] - colours[i, 0]
+                e1 = volume_colour[x, y, z, 1] - colours[i, 1]
+                e2 = volume_colour[x, y, z, 2] - colours[i, 2]
+                welcome += s
+                mean0 += s * e0
+                mean1 += s * e1
+                mean2 += s * e2
+                square += s * (e0 * e0 + e1 * e1 + e2 * e2)
+            else:
+                penalty += s
+        if i == m // 4 and welcome + penalty < give_up * i:
+            return np.float32(-1)
+    if welcome > 0:
+        offset = (mean0 * mean0 + mean1 * mean1 + mean2 * mean2) / welcome
+        variance = (square - np.float32(0.8) * offset) / welcome
+        welcome /= np.float32(1) + variance * np.float32(1 / COLOUR_SCALE**2)
+    return (welcome + penalty) / m
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _crosses_box(px, py, pz, d, low, high):  # pragma: no cover - compiled
+    near, far = -1e9, 1e9
+    p = (px, py, pz)
+    for a in range(3):
+        if abs(d[a]) < 1e-6:
+            if p[a] < low[a] or p[a] > high[a]:
+                return False
+        else:
+            t0, t1 = (low[a] - p[a]) / d[a], (high[a] - p[a]) / d[a]
+            near, far = max(near, min(t0, t1)), min(far, max(t0, t1))
+    return near <= far
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def _scan_revolute(
+    seeds, colours, directions, angles, origin, voxel, score, volume_colour, low, high, reach
+):  # pragma: no cover - compiled
+    n_d, n_a, m = directions.shape[0], angles.shape[0], seeds.shape[0]
+    best = np.full((n_d, n_a), np.float32(-1))
+    pivots = np.zeros((n_d, n_a, 3))
+    c = np.zeros(3)
+    for i in range(m):
+        for a in range(3):
+            c[a] += seeds[i, a] / m
+    for job in prange(n_d * n_a):
+        d, theta = directions[job // n_a], angles[job % n_a]
+        helper = np.zeros(3)
+        helper[np.argmin(np.abs(d))] = 1
+        u = np.cross(d, helper)
+        u /= np.sqrt((u * u).sum())
+        w = np.cross(d, u)
+        cs, sn = np.cos(theta), np.sin(theta)
+        q = np.empty((m, 3), np.float32)
+        for i in range(m):
+            r = seeds[i] - c
+            along = (r * d).sum()
+            cross = np.cross(d, r)
+            for a in range(3):
+                q[i, a] = c[a] + r[a] * cs + cross[a] * sn + d[a] * along * (1 - cs)
+        half = 0.5 / np.tan(theta / 2)
+        n = int(min(reach, 2 * reach * abs(np.sin(theta / 2))) / voxel)
+        shift = np.empty(3, np.float32)
+        top = np.float32(-1)
+        for ia in range(-n, n + 1):
+            for ib in range(-n, n + 1):
+                ta, tb = ia * voxel, ib * voxel
+                # The fixed point of rotating by theta about c and then shifting by (ta, tb).
+                pa, pb = 0.5 * ta - half * tb, 0.5 * tb + half * ta
+                px, py, pz = (
+                    c[0] + pa * u[0] + pb * w[0],
+                    c[1] + pa * u[1] + pb * w[1],
+                    c[2] + pa * u[2] + pb * w[2],
+                )
+                if not _crosses_box(px, py, pz, d, low, high):
+                    continue
+                for a in range(3):
+                    shift[a] = ta * u[a] + tb * w[a]
+                s = _sum(
+                    q, colours, shift, origin, np.float32(1 / voxel), score, volume_colour, max(top, np.float32(0)) * 0.4
+                )
+                if s > top:
+                    top = s
+                    pivots[job // n_a, job % n_a, 0] = px
+                    pivots[job // n_a, job % n_a, 1] = py
+                    pivots[job // n_a, job % n_a, 2] = pz
+        best[job // n_a, job % n_a] = top
+    return best, pivots
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def _scan_prismatic(
+    seeds, colours, directions, slides, origin, voxel, score, volume_colour
+):  # pragma: no cover - compiled
+    n_d, n_s = directions.shape[0], slides.shape[0]
+    best = np.full((n_d, n_s), np.float32(-1))
+    for job in prange(n_d * n_s):
+        shift = (directions[job // n_s] * slides[job % n_s]).astype(np.float32)
+        best[job // n_s, job % n_s] = _sum(
+            seeds, colours, shift, origin, np.float32(1 / voxel), score, volume_colour, np.float32(-9)
+        )
+    return best
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A hypothesis: one degree of freedom from this state to the other, world frame."""
+
+    kind: str
+    """``revolute`` or ``prismatic``."""
+    axis: np.ndarray
+    """(3,) unit."""
+    pivot: np.ndarray
+    """(3,) a point on the axis; the seeds' centroid for a slide."""
+    value: float
+    """Radians or scene units."""
+    score: float
+    """Mean score of the seeds, at most 1."""
+
+    @property
+    def T(self) -> np.ndarray:
+        """4×4 from this state's configuration to the other's."""
+        if self.kind == "prismatic":
+            return prismatic(self.axis, self.value)
+        return revolute(self.axis, self.pivot, self.value)
+
+
+def scan(
+    seeds: np.ndarray,
+    colours: np.ndarray,
+    directions: np.ndarray,
+    volume: ScoreVolume,
+    *,
+    kinds: tuple[str, ...] = ("revolute", "prismatic"),
+    values: np.ndarray | None = None,
+    near: Motion | None = None,
+    keep: int = 12,
+) -> list[Motion]:
+    """The best distinct motions of seeds (m, 3) with colours (m, 3), each about one of ``directions`` (d, 3).
+
+    Args:
+        values: angles (radians) or slides (scene units) to try, of the one kind in ``kinds``; None tries ±5° to ±150°
+            and every slide that stays within the object.
+        near: keep a revolute axis within four voxels of this motion's pivot.
+
+    Distinct: their mean displacement of the seeds differs by more than three voxels.
+    """
+    directions = np.ascontiguousarray(directions, dtype=np.float64)
+    grid = (volume.origin.astype(np.float32), volume.voxel, volume.score, volume.colour)
+    seeds32, colours32 = seeds.astype(np.float32), colours.astype(np.float32)
+    low, high = volume.origin, volume.origin + (np.array(volume.score.shape) - 1) * volume.voxel
+    reach = float(np.linalg.norm(high - low)) / 2
+    centroid = seeds.mean(0)
+    found: list[Motion] = []
+    if "revolute" in kinds:
+        angles = values if values is not None else both_signs(np.radians(np.arange(5, 151, 5)))
+        angles = angles[np.abs(angles) > 1e-3]
+        box = (low, high) if near is None else (near.pivot - 4 * volume.voxel, near.pivot + 4 * volume.voxel)
+        score, pivots = _scan_revolute(seeds32, colours32, directions, angles, *grid, *box, reach)
+        found += [
+            Motion("revolute", directions[i], pivots[i, j], float(angles[j]), float(score[i, j]))
+            for i, j in np.ndindex(score.shape)
+        ]
+    if "prismatic" in kinds:
+        slides = values if values is not None else both_signs(np.arange(1, 1.2 * reach / volume.voxel, 0.5) * volume.voxel)
+        score = _scan_prismatic(seeds32, colours32, directions, slides, *grid)
+        found += [
+            Motion("prismatic", directions[i], centroid, float(slides[j]), float(score[i, j]))
+            for i, j in np.ndindex(score.shape)
+        ]
+    found.sort(key=lambda m: -m.score)
+    kept: list[Motion] = []
+    ends: list[np.ndarray] = []
+    for motion in found:
+        T = motion.T
+        end = seeds @ T[:3, :3].T + T[:3, 3]
+        if all(np.linalg.norm(end - e, axis=1).mean() > 3 * volume.voxel for e in ends):
+            kept.append(motion)
+            ends.append(end)
+            if len(kept) == keep:
+                break
+    return kept
+
+
+def both_signs(values: np.ndarray) -> np.ndarray:
+    return np.concatenate([-values[::-1], values])

@@ -1,0 +1,492 @@
+"""Which Gaussians move, with which rigid motion, and how many parts that makes. No number of parts is needed.
+
+Seeds are surface points that the other state's cameras would see floating in free space: they must have moved. Every
+motion of one degree of freedom is tried on them (``search``), the fewest motions that explain most seeds are kept
+(description length), and all Gaussians of both states then vote for a label, each with its neighbours and with the
+place where its label says it went.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.cluster.vq import kmeans2
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from hingesplat.capture import View
+from hingesplat.gaussians import SH_C0, Gaussians
+from hingesplat.search import COLOUR_SCALE, Motion, ScoreVolume, scan, score_volume
+from hingesplat.visibility import COLOUR, FREE, HIDDEN, SURFACE, Sight, ask, look
+
+
+@dataclass(frozen=True)
+class SegmentConfig:
+    """Finding the parts and their first motions."""
+
+    sight_size: int = 200
+    """Longest side in pixels of the depth pictures that judge the hypotheses."""
+    tolerance: float = 0.012
+    """Half-width of a surface, as a fraction of the object's extent."""
+    cells: int = 56
+    """Voxels along the object's longest side in the coarse search."""
+    seeds_per_search: int = 160
+    """Seeds moved in one search."""
+    explained_cost: float = 0.65
+    """A seed that a motion explains worse than this counts as unexplained."""
+    part_cost: float = 25.0
+    """Description length of one more part, in seeds (a seed stands for 0.012² of the extent's square)."""
+    min_part_seeds: int = 25
+    """A part must own at least this many seeds."""
+    max_parts: int = 12
+    """Upper bound on movable parts when their number is not given."""
+    rounds: int = 3
+    """Rounds of relabelling and refining the motions."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What was fitted to one state, thinned to the Gaussians that lie on its visible surface."""
+
+    points: np.ndarray
+    """(n, 3)"""
+    colours: np.ndarray
+    """(n, 3)"""
+    index: np.ndarray
+    """(n,) rows of the state's Gaussians."""
+    sight: Sight
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """Parts found: part k + 1 moves by ``motions[k]`` from state 0 to the other state."""
+
+    labels: tuple[np.ndarray, np.ndarray]
+    """Part id of every Gaussian of the two states."""
+    motions: tuple[Motion, ...]
+    unexplained: float
+    """Fraction of the seeds that no motion explains."""
+    seeds: int
+    """Number of (thinned) seeds of both states."""
+
+
+def bounds(surfaces: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner (3,) of all points, a few stragglers aside, with a margin."""
+    points = np.concatenate(surfaces)
+    low, high = np.quantile(points, 0.002, axis=0), np.quantile(points, 0.998, axis=0)
+    margin = 0.03 * (high - low).max()
+    return low - margin, high + margin
+
+
+def on_surface(gaussians: Gaussians, sight: Sight) -> Surface:
+    """The Gaussians that the state's own cameras see on its surface."""
+    points = gaussians.means.numpy()
+    colours = (gaussians.sh[:, 0] * SH_C0 + 0.5).numpy()
+    answer = ask(points, colours, sight)
+    views = answer[:, : HIDDEN + 1].sum(1)
+    good = (answer[:, SURFACE] >= 2) & (answer[:, FREE] <= 0.15 * views) & (gaussians.opacities.numpy() > 0.2)
+    index = np.flatnonzero(good)
+    return Surface(points[index], colours[index], index, sight)
+
+
+def floating(answer: np.ndarray) -> np.ndarray:
+    """(n,) bool: points that enough of the other state's cameras see in free space."""
+    return (answer[:, FREE] >= 3) & (answer[:, FREE] > 0.15 * answer[:, : HIDDEN + 1].sum(1))
+
+
+def thin(points: np.ndarray, size: float, rng: np.random.Generator) -> np.ndarray:
+    """Indices of one random point in each occupied cube of the given size, so that area counts, not texture."""
+    order = rng.permutation(len(points))
+    _, first = np.unique(np.floor(points[order] / size).astype(np.int64), axis=0, return_index=True)
+    return order[np.sort(first)]
+
+
+def components(points: np.ndarray, radius: float) -> np.ndarray:
+    """(n,) label of the connected piece each point belongs to, neighbours being closer than ``radius``."""
+    if len(points) == 0:
+        return np.zeros(0, int)
+    pairs = cKDTree(points).query_pairs(radius, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
+    return connected_components(graph, directed=False)[1]
+
+
+def groups_to_try(points: np.ndarray, extent: float, seed: int) -> list[np.ndarray]:
+    """Connected pieces of the seeds, and patches of the pieces that are large enough to be several parts at once."""
+    label = components(points, 0.035 * extent)
+    groups = []
+    for piece in range(label.max(initial=-1) + 1):
+        index = np.flatnonzero(label == piece)
+        if len(index) < 12:
+            continue
+        groups.append(index)
+        patches = min(len(index) // 60, 10)
+        if patches >= 2:
+            which = kmeans2(points[index], patches, seed=seed, minit="++")[1]
+            groups += [index[which == p] for p in range(patches) if (which == p).sum() >= 12]
+    return groups
+
+
+def axis_directions(groups: Sequence[np.ndarray]) -> np.ndarray:
+    """(d, 3) unit directions to try: the world's, and each group's principal ones; none twice (within 8°)."""
+    candidates = list(np.eye(3))
+    for points in groups:
+        candidates += list(np.linalg.svd(points - points.mean(0), full_matrices=False)[2])
+    kept: list[np.ndarray] = []
+    for d in candidates:
+        if all(abs(d @ k) < np.cos(np.radians(8)) for k in kept):
+            kept.append(d)
+    return np.array(kept[:12])
+
+
+def inverted(motion: Motion) -> Motion:
+    return replace(motion, value=-motion.value)
+
+
+def moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """Points (n, 3) under a 4×4 transform."""
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def seed_costs(points: np.ndarray, colours: np.ndarray, motion: Motion, volume: ScoreVolume) -> np.ndarray:
+    """(n,) in [0, 2]: how badly the other state receives each seed; 0 is a new surface of the same colour."""
+    q = np.round((moved(points, motion.T) - volume.origin) / volume.voxel).astype(int)
+    inside = ((q >= 0) & (q < volume.score.shape)).all(1)
+    q = np.where(inside[:, None], q, 0)
+    at = tuple(q.T)
+    score = np.where(inside, volume.score[at], -1.0)
+    difference = volume.colour[at] - colours
+    weight = np.maximum(score, 0)[:, None]
+    difference = difference - 0.8 * (weight * difference).sum(0) / max(weight.sum(), 1e-6)
+    alike = 1 / (1 + (difference**2).sum(1) / COLOUR_SCALE**2)
+    return 1 - np.where(score > 0, score * alike, score)
+
+
+def select_motions(costs: np.ndarray, config: SegmentConfig, parts: int | None) -> list[int]:
+    """Greedy choice of the hypotheses (columns) that explain the seeds (rows) at the least description length.
+
+    Args:
+        costs: (seeds, hypotheses).
+        parts: exactly this many, or as many as pay for themselves.
+    """
+    unexplained = np.full(len(costs), config.explained_cost)
+    chosen: list[int] = []
+    price = config.part_cost
+    limit = parts if parts is not None else config.max_parts
+    while len(chosen) < limit:
+        gain = np.maximum(unexplained[:, None] - costs, 0).sum(0)
+        best = int(gain.argmax())
+        if gain[best] <= (0 if parts is not None else price):
+            break
+        chosen.append(best)
+        unexplained = np.minimum(unexplained, costs[:, best])
+        # A hypothesis that later ones made superfluous goes.
+        for old in list(chosen[:-1]):
+            rest = [c for c in chosen if c != old]
+            without = np.minimum(config.explained_cost, costs[:, rest].min(1))
+            if parts is None and (without - unexplained).sum() < price:
+                chosen, unexplained = rest, without
+    return chosen
+
+
+def refine_motion(
+    motion: Motion, points: np.ndarray, colours: np.ndarray, volume: ScoreVolume, spread_deg: float
+) -> Motion:
+    """A finer search around one hypothesis: its axis tilted by up to ``spread_deg``, angles and slides to match."""
+    tilt = np.tan(np.radians(spread_deg))
+    helper = np.eye(3)[np.abs(motion.axis).argmin()]
+    u = np.cross(motion.axis, helper)
+    u /= np.linalg.norm(u)
+    w = np.cross(motion.axis, u)
+    directions = np.array([motion.axis + tilt * (a * u + b * w) for a in (-1, 0, 1) for b in (-1, 0, 1)])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    values = motion.value + np.linspace(-1, 1, 9) * (
+        np.radians(spread_deg) if motion.kind == "revolute" else 2 * volume.voxel
+    )
+    found = scan(points, colours, directions, volume, kinds=(motion.kind,), values=values, near=motion, keep=1)
+    return found[0] if found else motion
+
+
+def label_costs(
+    surface: Surface, other: Sight, motions: Sequence[Motion], *, forward: bool
+) -> np.ndarray:
+    """(n, 1 + motions) cost of each label for each surface point, from the other state's photographs alone."""
+    columns = []
+    for motion in [None, *motions]:
+        points = surface.points
+        if motion is not None:
+            points = moved(points, motion.T if forward else np.linalg.inv(motion.T))
+        answer = ask(points, surface.colours, other)
+        views = np.maximum(answer[:, : HIDDEN + 1].sum(1), 1)
+        free, seen, hidden = answer[:, FREE] / views, answer[:, SURFACE] / views, answer[:, HIDDEN] / views
+        contradiction = np.clip(free / 0.25, 0, 1)
+        colour = np.clip((answer[:, COLOUR] - 0.05) / 0.5, 0, 1) * seen / np.maximum(seen + hidden, 1e-6)
+        columns.append(contradiction + 0.5 * colour + 0.25 * hidden + (0.0 if motion is None else 0.1))
+    return np.stack(columns, 1)
+
+
+def neighbour_weights(points: np.ndarray, colours: np.ndarray, radius: float, k: int = 12) -> csr_matrix:
+    """(n, n) sparse weights of the k nearest points, less for distance and for another colour."""
+    n = len(points)
+    k = min(k, n - 1)
+    distance, index = cKDTree(points).query(points, k + 1)
+    row = np.repeat(np.arange(n), k)
+    column = index[:, 1:].ravel()
+    difference = np.linalg.norm(colours[row] - colours[column], axis=1)
+    weight = np.exp(-((distance[:, 1:].ravel() / radius) ** 2)) * np.exp(-((difference / 0.3) ** 2))
+    return csr_matrix((weight, (row, column)), shape=(n, n))
+
+
+Labels = tuple[np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Labelling:
+    """The labelling problem of both states' surface points: mean field over labels, description length over motions."""
+
+    surfaces: tuple[Surface, Surface]
+    weights: tuple[csr_matrix, csr_matrix]
+    trees: tuple[cKDTree, cKDTree]
+    extent: float
+    smoothness: float = 0.25
+    consistency: float = 0.6
+
+    @staticmethod
+    def of(surfaces: tuple[Surface, Surface], extent: float) -> "Labelling":
+        w0, w1 = (neighbour_weights(s.points, s.colours, 0.025 * extent) for s in surfaces)
+        return Labelling(surfaces, (w0, w1), (cKDTree(surfaces[0].points), cKDTree(surfaces[1].points)), extent)
+
+    def costs(self, motions: Sequence[Motion]) -> list[np.ndarray]:
+        a, b = self.surfaces
+        return [label_costs(a, b.sight, motions, forward=True), label_costs(b, a.sight, motions, forward=False)]
+
+    def partners(self, motions: Sequence[Motion]) -> list[np.ndarray]:
+        """(n_s, 1 + motions): the other state's point with which each point coincides under each label, or −1."""
+        result = []
+        for s in (0, 1):
+            columns = []
+            for motion in [None, *motions]:
+                T = np.eye(4) if motion is None else motion.T if s == 0 else np.linalg.inv(motion.T)
+                distance, index = self.trees[1 - s].query(moved(self.surfaces[s].points, T))
+                columns.append(np.where(distance < 0.025 * self.extent, index, -1))
+            result.append(np.stack(columns, 1))
+        return result
+
+    def mean_field(
+        self, costs: list[np.ndarray], partners: list[np.ndarray], iterations: int = 20
+    ) -> tuple[Labels, float]:
+        """Labels of both states and the energy they cost.
+
+        A point hears its own costs, its neighbours, and the point of the other state it would coincide with under
+        each label: if k carries me there, the one who lives there should be k, too.
+        """
+        q = [softmax(-c / 0.1) for c in costs]
+        label = np.arange(costs[0].shape[1])
+        energy = 0.0
+        for iteration in range(iterations):
+            temperature = 0.15 - 0.1 * iteration / iterations
+            updated, energy = [], 0.0
+            for s in (0, 1):
+                support = self.smoothness * (self.weights[s] @ q[s])
+                partner = q[1 - s][np.maximum(partners[s], 0), label]
+                meeting = self.consistency * np.where(partners[s] >= 0, partner, 0.3)
+                total = costs[s] - support - meeting
+                updated.append(softmax(-total / temperature))
+                # Each edge is heard from both its ends, so pairs count half.
+                energy += float((updated[s] * (costs[s] - 0.5 * support - 0.5 * meeting)).sum())
+            q = updated
+        return (q[0].argmax(1), q[1].argmax(1)), energy
+
+    def solve(
+        self, motions: Sequence[Motion], part_cost: float, parts: int | None
+    ) -> tuple[list[Motion], Labels]:
+        """Drop motions one by one as long as doing without costs less than a part; then the labels of the rest."""
+        motions = list(motions)
+        costs, partners = self.costs(motions), self.partners(motions)
+        columns = list(range(len(motions) + 1))
+
+        def run(keep: list[int], iterations: int) -> tuple[Labels, float]:
+            return self.mean_field([c[:, keep] for c in costs], [p[:, keep] for p in partners], iterations)
+
+        while len(columns) > 1:
+            energy = run(columns, 8)[1]
+            trials = {k: run([c for c in columns if c != k], 8)[1] for k in columns[1:]}
+            worst = min(trials, key=lambda k: trials[k])
+            if (parts is None and trials[worst] - energy > part_cost) or len(columns) - 1 == parts:
+                break
+            columns.remove(worst)
+        return [motions[k - 1] for k in columns[1:]], run(columns, 20)[0]
+
+
+def softmax(x: np.ndarray) -> np.ndarray:
+    e = np.exp(x - x.max(1, keepdims=True))
+    return e / e.sum(1, keepdims=True)
+
+
+def segment(
+    gaussians: tuple[Gaussians, Gaussians],
+    views: tuple[Sequence[View], Sequence[View]],
+    config: SegmentConfig,
+    *,
+    parts: int | None = None,
+    seed: int = 0,
+) -> Segmentation:
+    """Two states' Gaussians and photographs to parts and their first motions.
+
+    Args:
+        gaussians: fitted to state 0 and to the other state.
+        views: the training photographs of the same two states.
+        parts: number of movable parts, or None to find it.
+    """
+    rng = np.random.default_rng(seed)
+    low, high = bounds([g.means.numpy() for g in gaussians])
+    extent = float((high - low).max())
+    sights = [look(g, v, config.sight_size, config.tolerance * extent) for g, v in zip(gaussians, views, strict=True)]
+    surfaces = (on_surface(gaussians[0], sights[0]), on_surface(gaussians[1], sights[1]))
+    seeds = []
+    for s in (0, 1):
+        surface = surfaces[s]
+        index = np.flatnonzero(floating(ask(surface.points, surface.colours, sights[1 - s])))
+        seeds.append(index[thin(surface.points[index], 0.012 * extent, rng)])
+
+    def volume(s: int, cells: int) -> ScoreVolume:
+        return score_volume(surfaces[s].points, surfaces[s].colours, sights[s], sights[1 - s], low, high, cells)
+
+    coarse, fine = [volume(s, config.cells) for s in (0, 1)], [volume(s, 2 * config.cells) for s in (0, 1)]
+    pool = propose(surfaces, seeds, coarse, fine, extent, config, rng)
+    n_seeds = sum(len(i) for i in seeds)
+    if not pool:
+        empty = (np.zeros(len(gaussians[0]), int), np.zeros(len(gaussians[1]), int))
+        return Segmentation(empty, (), 0.0, n_seeds)
+
+    def costs_of(candidates: Sequence[Motion]) -> np.ndarray:
+        blocks = []
+        for s in (0, 1):
+            p, c = surfaces[s].points[seeds[s]], surfaces[s].colours[seeds[s]]
+            directed = candidates if s == 0 else [inverted(m) for m in candidates]
+            blocks.append(np.stack([seed_costs(p, c, m, fine[1 - s]) for m in directed], 1))
+        return np.concatenate(blocks)
+
+    chosen = [pool[k] for k in select_motions(costs_of(pool), config, parts)]
+    problem = Labelling.of(surfaces, extent)
+    owned: Labels = tuple(np.zeros(len(x.points), int) for x in surfaces)
+    for round_ in range(config.rounds):
+        chosen = [
+            _refit(m, own, surfaces, fine, 6.0 / 2**round_, config, rng)
+            for m, own in _owners(chosen, costs_of(chosen), seeds, config, owned if round_ else None)
+        ]
+        chosen, owned = problem.solve(chosen, config.part_cost * 2, parts)
+    chosen, owned = split_pieces(chosen, owned, surfaces, extent, config)
+    costs = costs_of(chosen) if chosen else np.ones((n_seeds, 1))
+    unexplained = float((costs.min(1) >= config.explained_cost).mean())
+    labels = tuple(spread_labels(gaussians[s].means.numpy(), surfaces[s], owned[s]) for s in (0, 1))
+    return Segmentation((labels[0], labels[1]), tuple(chosen), unexplained, n_seeds)
+
+
+def _owners(
+    motions: Sequence[Motion],
+    costs: np.ndarray,
+    seeds: Sequence[np.ndarray],
+    config: SegmentConfig,
+    owned: "Labels | None",
+) -> list[tuple[Motion, tuple[np.ndarray, np.ndarray]]]:
+    """Each motion with the surface points of both states to refine it on: its labelled points, or at first its seeds."""
+    if owned is not None:
+        return [(m, (np.flatnonzero(owned[0] == k + 1), np.flatnonzero(owned[1] == k + 1))) for k, m in enumerate(motions)]
+    owner = np.where(costs.min(1) < config.explained_cost, costs.argmin(1), -1)
+    first, second = owner[: len(seeds[0])], owner[len(seeds[0]) :]
+    return [(m, (seeds[0][first == k], seeds[1][second == k])) for k, m in enumerate(motions)]
+
+
+def split_pieces(
+    motions: Sequence[Motion],
+    owned: "Labels",
+    surfaces: tuple[Surface, Surface],
+    extent: float,
+    config: SegmentConfig,
+) -> tuple[list[Motion], "Labels"]:
+    """One part is one piece: two large pieces far apart that share a motion become two parts with that motion.
+
+    Two doors one above the other, turned by the same angle about the same line, are such a pair.
+    """
+    result: list[Motion] = []
+    labels = tuple(np.zeros_like(o) for o in owned)
+    for k, motion in enumerate(motions):
+        rows = [np.flatnonzero(o == k + 1) for o in owned]
+        both = np.concatenate([moved(surfaces[0].points[rows[0]], motion.T), surfaces[1].points[rows[1]]])
+        piece = components(both, 0.025 * extent)
+        size = np.bincount(piece, minlength=1)
+        large = np.flatnonzero(size >= max(0.2 * size.max(), 3 * config.min_part_seeds))
+        if len(large) == 0:
+            continue
+        centres = np.stack([both[piece == p].mean(0) for p in large])
+        tree = [cKDTree(both[piece == p]) for p in large]
+        distance = np.stack([t.query(both)[0] for t in tree], 1)
+        nearest = distance.argmin(1)
+        split = np.split(nearest, [len(rows[0])])
+        for p in range(len(centres)):
+            result.append(motion)
+            for s in (0, 1):
+                labels[s][rows[s][split[s] == p]] = len(result)
+    return result, (labels[0], labels[1])
+
+
+def propose(
+    surfaces: tuple[Surface, Surface],
+    seeds: Sequence[np.ndarray],
+    coarse: Sequence[ScoreVolume],
+    fine: Sequence[ScoreVolume],
+    extent: float,
+    config: SegmentConfig,
+    rng: np.random.Generator,
+) -> list[Motion]:
+    """Hypotheses, as motions from state 0 to 1, from every group of seeds of both states."""
+    groups = []
+    for s in (0, 1):
+        p = surfaces[s].points[seeds[s]]
+        groups += [(s, seeds[s][g]) for g in groups_to_try(p, extent, seed=int(rng.integers(2**31)))]
+    if not groups:
+        return []
+    directions = axis_directions([surfaces[s].points[g] for s, g in groups])
+    pool = []
+    for s, group in groups:
+        chosen = rng.choice(group, min(config.seeds_per_search, len(group)), replace=False)
+        p, c = surfaces[s].points[chosen], surfaces[s].colours[chosen]
+        found = scan(p, c, directions, coarse[1 - s], keep=4)
+        for motion in found:
+            if motion.score > max(0.1, 0.6 * found[0].score):
+                # Compare hypotheses at their best: on the grid a true one may be 3° off and lose to a lucky one.
+                for spread in (4.0, 1.5):
+                    motion = refine_motion(motion, p, c, fine[1 - s], spread)
+                pool.append(motion if s == 0 else inverted(motion))
+    return pool
+
+
+def _refit(
+    motion: Motion,
+    own: tuple[np.ndarray, np.ndarray],
+    surfaces: tuple[Surface, Surface],
+    fine: Sequence[ScoreVolume],
+    spread_deg: float,
+    config: SegmentConfig,
+    rng: np.random.Generator,
+) -> Motion:
+    """Refine on the points that the motion owns, in whichever state has more of them."""
+    s = int(len(own[1]) > len(own[0]))
+    if len(own[s]) < config.min_part_seeds:
+        return motion
+    chosen = rng.choice(own[s], min(2 * config.seeds_per_search, len(own[s])), replace=False)
+    p, c = surfaces[s].points[chosen], surfaces[s].colours[chosen]
+    refined = refine_motion(motion if s == 0 else inverted(motion), p, c, fine[1 - s], spread_deg)
+    return refined if s == 0 else inverted(refined)
+
+
+def spread_labels(points: np.ndarray, surface: Surface, labels: np.ndarray) -> np.ndarray:
+    """(n,) labels for all Gaussians: those off the surface take their nearest surface point's."""
+    nearest = cKDTree(surface.points).query(points)[1]
+    spread = labels[nearest]
+    spread[surface.index] = labels
+    return spread
+
+
+__all__ = ["SegmentConfig", "Segmentation", "segment"]

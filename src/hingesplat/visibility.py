@@ -1,0 +1,135 @@
+"""What the photographs of one state say about a point: empty here, on the surface here, or hidden.
+
+A point that is drawn in front of what a photograph shows, or beside the object's mask, cannot be there. This is the
+judge of every motion hypothesis: the other state's pictures, never point matches.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numba import njit, prange
+
+from hingesplat.capture import View
+from hingesplat.gaussians import Gaussians
+from hingesplat.render import render
+
+FREE, SURFACE, HIDDEN, COLOUR = range(4)
+"""Columns of ``ask``'s answer."""
+
+
+@dataclass(frozen=True)
+class Sight:
+    """Low-resolution depth, colour and mask of one state from each of its cameras."""
+
+    P: np.ndarray
+    """(v, 3, 4) float32 world to pixel projection; the third row gives depth."""
+    depth: np.ndarray
+    """(v, h, w) float32 rendered depth, scene units; 0 off the object."""
+    rgb: np.ndarray
+    """(v, h, w, 3) float32 photograph over white."""
+    tolerance: float
+    """Half-width of the band around the surface, scene units."""
+
+
+@torch.no_grad()
+def look(gaussians: Gaussians, views: Sequence[View], size: int, tolerance: float) -> Sight:
+    """Render the state's depth at most ``size`` pixels wide from each photograph's camera.
+
+    The mask comes from the photograph, so that a floater makes no surface where the photograph shows background.
+    """
+    longest = max(max(v.camera.width, v.camera.height) for v in views)
+    factor = max(longest / size, 1.0)
+    width = max(round(v.camera.width / factor) for v in views)
+    height = max(round(v.camera.height / factor) for v in views)
+    P, depth, rgb = [], [], []
+    for view in views:
+        camera = view.camera.scaled(round(view.camera.width / factor), round(view.camera.height / factor))
+        r = render(gaussians, camera)
+        rgba = torch.from_numpy(view.rgba).permute(2, 0, 1)[None].float() / 255
+        small = torch.nn.functional.interpolate(rgba, (camera.height, camera.width), mode="area")[0]
+        mask = small[3] > 0.5
+        solid = r.alpha > 0.3
+        d = torch.where(mask & solid, r.depth / r.alpha.clamp_min(1e-3), torch.where(mask, -1.0, 0.0))
+        picture = small[:3] * small[3:] + 1 - small[3:]
+        pad = (0, width - camera.width, 0, height - camera.height)
+        depth.append(torch.nn.functional.pad(d, pad).numpy())
+        rgb.append(torch.nn.functional.pad(picture, pad, value=1.0).permute(1, 2, 0).numpy())
+        K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+        P.append(K @ camera.T_camera_world[:3])
+    return Sight(
+        np.stack(P).astype(np.float32),
+        np.ascontiguousarray(np.stack(depth), dtype=np.float32),
+        np.ascontiguousarray(np.stack(rgb), dtype=np.float32),
+        tolerance,
+    )
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def _ask(points, colours, P, depth, rgb, tolerance, answer):  # pragma: no cover - compiled
+    views, height, width = depth.shape
+    for i in prange(points.shape[0]):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        free = 0.0
+        surface = 0.0
+        hidden = 0.0
+        difference = 0.0
+        for v in range(views):
+            p = P[v]
+            d = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
+            if d < 1e-3:
+                continue
+            u = int(np.floor((p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]) / d))
+            w = int(np.floor((p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]) / d))
+            if u < 1 or w < 1 or u >= width - 1 or w >= height - 1:
+                continue
+            # The nearest of nine pixels decides, so that an edge one pixel off is no contradiction.
+            off = 0
+            least = np.float32(1e9)
+            signed = np.float32(0)
+            for b in range(-1, 2):
+                for a in range(-1, 2):
+                    s = depth[v, w + b, u + a]
+                    if s == 0:
+                        off += 1
+                    elif s > 0 and abs(d - s) < least:
+                        least = abs(d - s)
+                        signed = d - s
+            if off == 9:
+                free += 1
+            elif least < tolerance:
+                surface += 1
+                e0 = rgb[v, w, u, 0] - colours[i, 0]
+                e1 = rgb[v, w, u, 1] - colours[i, 1]
+                e2 = rgb[v, w, u, 2] - colours[i, 2]
+                difference += np.sqrt(e0 * e0 + e1 * e1 + e2 * e2)
+            elif least < 1e8:
+                if signed < -tolerance:
+                    free += 1
+                else:
+                    hidden += 1
+        answer[i, 0] = free
+        answer[i, 1] = surface
+        answer[i, 2] = hidden
+        answer[i, 3] = difference / surface if surface > 0 else 0.0
+
+
+def ask(points: np.ndarray, colours: np.ndarray, sight: Sight) -> np.ndarray:
+    """What a state's cameras say of points (n, 3) with colours (n, 3).
+
+    Returns:
+        (n, 4): the number of views in which the point is in free space, on the surface, hidden behind it; and the mean
+        Euclidean RGB difference over the views that see it on the surface.
+    """
+    answer = np.empty((len(points), 4), np.float32)
+    _ask(
+        np.ascontiguousarray(points, dtype=np.float32),
+        np.ascontiguousarray(colours, dtype=np.float32),
+        sight.P,
+        sight.depth,
+        sight.rgb,
+        np.float32(sight.tolerance),
+        answer,
+    )
+    return answer

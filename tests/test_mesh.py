@@ -1,0 +1,178 @@
+"""Part meshes: closed, of the right size, and silent about what nobody saw."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.spatial import KDTree
+
+from hingesplat.camera import Camera
+from hingesplat.gaussians import SH_C0, Gaussians, concatenate
+from hingesplat.mesh import (
+    DepthView,
+    MeshConfig,
+    close_surface,
+    fuse_depth,
+    hull_mesh,
+    mesh_parts,
+    tangent_planes,
+)
+from hingesplat.se3 import matrix_to_wxyz
+from hingesplat.twin import Joint
+
+
+def look_at(eye: np.ndarray, target: np.ndarray | None = None, size: int = 96) -> Camera:
+    forward = (np.zeros(3) if target is None else target) - eye
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, [0.1, 0.02, 1.0])
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
+    T[:3, 3] = eye
+    return Camera(T, 1.2 * size, 1.2 * size, size / 2, size / 2, size, size)
+
+
+def sphere_of_cameras(n: int, radius: float = 3.0, size: int = 96) -> list[Camera]:
+    """Spread evenly over the whole sphere."""
+    k = np.arange(n) + 0.5
+    z, turn = 1 - 2 * k / n, np.pi * (1 + 5**0.5) * k
+    r = np.sqrt(1 - z**2)
+    return [look_at(radius * p, size=size) for p in np.column_stack([r * np.cos(turn), r * np.sin(turn), z])]
+
+
+def traced(camera: Camera, mesh: trimesh.Trimesh) -> DepthView:
+    """Exact depth of a mesh, all of it the part's own."""
+    origin, rays = camera.rays()
+    flat = rays.reshape(-1, 3)
+    points, index, _ = mesh.ray.intersects_location(
+        np.broadcast_to(origin, flat.shape), flat, multiple_hits=False
+    )
+    depth = np.full(len(flat), np.inf, np.float32)
+    depth[index] = (points - origin) @ camera.T_world_camera[:3, 2]
+    depth = depth.reshape(camera.height, camera.width)
+    rgb = np.full((*depth.shape, 3), 0.5, np.float32)
+    return DepthView(camera, depth, np.isfinite(depth), rgb, tangent_planes(camera, depth))
+
+
+def fused(shape: trimesh.Trimesh, cameras: list[Camera], resolution: int = 64) -> trimesh.Trimesh | None:
+    voxel = float(shape.extents.max()) / resolution
+    lower = shape.bounds[0] - 4 * voxel
+    grid = tuple(int(n) for n in np.ceil(shape.extents / voxel) + 9)
+    assert len(grid) == 3
+    distance, _ = fuse_depth([traced(c, shape) for c in cameras], lower, grid, voxel, 2.5 * voxel)
+    return close_surface(distance, lower, voxel, MeshConfig())
+
+
+def box_gaussians(
+    extents: tuple[float, float, float], centre: tuple[float, float, float], part: int, spacing: float = 0.03
+) -> Gaussians:
+    """Round, opaque Gaussians on the faces of a box, coloured by part."""
+    box = trimesh.creation.box(extents, trimesh.transformations.translation_matrix(centre))
+    points, faces = trimesh.sample.sample_surface(box, int(4 * box.area / spacing**2), seed=part)
+    n = len(points)
+    turns = np.array([trimesh.geometry.align_vectors([0, 0, 1], v)[:3, :3] for v in box.face_normals])[faces]
+    scales = torch.tensor([spacing / 2.5, spacing / 2.5, spacing / 20]).log()
+    colour = torch.tensor([[0.8, 0.2, 0.2], [0.2, 0.7, 0.2], [0.2, 0.3, 0.9]])[part % 3]
+    return Gaussians(
+        means=torch.tensor(points, dtype=torch.float32),
+        quats=matrix_to_wxyz(torch.tensor(turns, dtype=torch.float32)),
+        log_scales=scales.expand(n, 3).clone(),
+        logit_opacities=torch.full((n,), 4.0),
+        sh=((colour - 0.5) / SH_C0).expand(n, 1, 3).clone(),
+        part=torch.full((n,), part, dtype=torch.int64),
+    )
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: trimesh.creation.box((1.0, 0.7, 0.5)),
+        lambda: trimesh.creation.icosphere(subdivisions=4, radius=0.5),
+        lambda: trimesh.creation.box((1.0, 0.6, 0.06)),
+    ],
+    ids=["box", "sphere", "plate"],
+)
+def test_a_shape_seen_from_everywhere_comes_back_closed_and_of_its_size(make: Callable[[], trimesh.Trimesh]):
+    shape = make()
+    mesh = fused(shape, sphere_of_cameras(40))
+    assert mesh is not None
+    assert mesh.is_watertight and mesh.is_winding_consistent
+    assert mesh.volume == pytest.approx(shape.volume, rel=0.1)
+    assert len(mesh.split()) == 1
+    surface, _ = trimesh.sample.sample_surface(shape, 100_000, seed=0)
+    assert KDTree(surface).query(mesh.vertices)[0].mean() < 0.5 / 64
+
+
+def test_the_unknown_stays_unknown_and_free_space_is_outside():
+    wall = trimesh.creation.box((4.0, 4.0, 0.2))
+    view = traced(look_at(np.array([0.0, 0.0, 3.0])), wall)
+    distance, weight = fuse_depth([view], np.array([0.0, 0.0, -1.0]), (1, 1, 41), 0.05, 0.1)
+    z = np.linspace(-1, 1, 41)
+    assert (distance[0, 0, z > 0.21] == 1).all() and (weight[0, 0, z > 0.21] > 0).all()
+    assert (weight[0, 0, z < -0.01] == 0).all()
+    near = np.abs(z - 0.1) < 0.09
+    assert distance[0, 0, near] == pytest.approx((z[near] - 0.1) / 0.1, abs=0.02)
+
+
+def test_a_stranger_in_front_clears_only_what_lies_before_it():
+    wall = trimesh.creation.box((4.0, 4.0, 0.2))
+    view = replace(traced(look_at(np.array([0.0, 0.0, 3.0])), wall), own=np.zeros((96, 96), bool))
+    _, weight = fuse_depth([view], np.array([0.0, 0.0, -1.0]), (1, 1, 41), 0.05, 0.1)
+    z = np.linspace(-1, 1, 41)
+    assert (weight[0, 0, z < 0.19] == 0).all() and (weight[0, 0, z > 0.21] == 1).all()
+
+
+def test_no_surface_gives_no_mesh_and_cavities_are_filled():
+    assert close_surface(np.ones((8, 8, 8), np.float32), np.zeros(3), 0.1, MeshConfig()) is None
+    x = np.linspace(-1, 1, 40)
+    r = np.sqrt(x[:, None, None] ** 2 + x[None, :, None] ** 2 + x**2)
+    shell = (np.abs(r - 0.6) - 0.2).astype(np.float32)
+    mesh = close_surface(shell, np.full(3, -1.0), x[1] - x[0], MeshConfig())
+    assert mesh is not None and mesh.is_watertight
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi * 0.8**3, rel=0.05)
+
+
+def test_the_hull_of_a_flat_or_tiny_group_is_still_a_solid():
+    flat = box_gaussians((0.4, 0.4, 0.02), (0, 0, 0), 0, 0.1)
+    for group in (flat, flat[torch.arange(1)]):
+        mesh = hull_mesh(group)
+        assert mesh.is_watertight and mesh.volume > 0
+
+
+def test_parts_of_a_scene_in_two_states_come_back_apart_closed_and_coloured():
+    """A door in front of a block: seen from the front only when shut, from both sides when it has opened."""
+    spacing = 0.04
+    scene = concatenate(
+        [
+            box_gaussians((0.8, 0.4, 0.8), (0, 0.21, 0), 0, spacing),
+            box_gaussians((0.8, 0.06, 0.8), (0, -0.05, 0), 1, spacing),
+        ]
+    )
+    joint = Joint(1, 0, "revolute", (0.0, 0.0, -1.0), (-0.4, -0.02, 0.0), (0.0, 1.5), (0.0, 1.5))
+    cameras = sphere_of_cameras(24)
+    states = [(cameras, {0: np.eye(4), 1: joint.transform(value)}) for value in joint.states]
+    meshes = mesh_parts(scene, states, MeshConfig(resolution=48, image_size=96))
+    for part_id, extents, rgb in [(0, (0.8, 0.4, 0.8), (204, 51, 51)), (1, (0.8, 0.06, 0.8), (51, 178, 51))]:
+        mesh = meshes[part_id]
+        assert mesh.is_watertight and mesh.volume > 0
+        centre = (0, 0.21, 0) if part_id == 0 else (0, -0.05, 0)
+        true = trimesh.creation.box(extents, trimesh.transformations.translation_matrix(centre))
+        surface, _ = trimesh.sample.sample_surface(true, 20_000, seed=0)
+        gap, _ = KDTree(surface).query(trimesh.sample.sample_surface(mesh, 5_000, seed=0)[0])
+        # The Gaussians spill over the rims of the faces by about a spacing.
+        assert np.percentile(gap, 95) < 1.5 * spacing
+        assert np.median(mesh.visual.vertex_colors[:, :3], axis=0) == pytest.approx(rgb, abs=12)
+    assert meshes[1].volume < 0.8 * 0.8 * 0.16
+
+
+def test_a_sheet_seen_from_one_side_is_a_thin_solid_not_a_brick():
+    rest = box_gaussians((0.8, 0.8, 0.8), (0, 0, 0), 0, 0.04)
+    front = (rest.means[:, 1] < -0.39).long()
+    cameras = [c for c in sphere_of_cameras(40) if c.centre[1] < -0.5]
+    mesh = mesh_parts(rest.with_part(front), [(cameras, {})], MeshConfig(resolution=48, image_size=96))[1]
+    assert mesh.is_watertight
+    assert mesh.extents[1] < 0.15
+    assert mesh.extents[[0, 2]] == pytest.approx([0.8, 0.8], abs=0.1)
