@@ -163,8 +163,10 @@ def _encode(pictures: Sequence[Image.Image]) -> bytes:
     strip = Image.new("RGB", (sum(p.width for p in samples), samples[0].height))
     for i, picture in enumerate(samples):
         strip.paste(picture, (i * picture.width, 0))
-    palette = strip.quantize(254, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-    palette.putpalette([*(palette.getpalette() or [])[: 3 * 254], 255, 255, 255])  # white stays white
+    palette = strip.quantize(256, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    colours = np.array(palette.getpalette(), np.uint8).reshape(-1, 3)
+    colours[(colours > 247).all(1)] = 255  # white stays white
+    palette.putpalette(colours.ravel().tolist())
     indexed = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
     file = io.BytesIO()
     indexed[0].save(file, "GIF", save_all=True, append_images=indexed[1:], duration=50, loop=0, disposal=1)

@@ -18,6 +18,9 @@ from hingesplat.visibility import FREE, SURFACE, Sight, ask
 COLOUR_SCALE = 0.2
 """RGB difference at which a surface of another colour counts half."""
 
+HIDDEN_SCORE = 0.3
+"""Score of unseen space, between a surface that fits (1) and free space (−1)."""
+
 
 @dataclass(frozen=True)
 class ScoreVolume:
@@ -38,7 +41,8 @@ def score_volume(
     """Score volume of the state seen by ``here``, whose surface is sampled by points (n, 3) with colours (n, 3).
 
     A surface voxel is worth 1 where the other state saw free space, 0.6 where the other state could not see,
-    and 0.15 where it saw a surface, too; free space costs −1.
+    and 0.15 where it saw a surface, too. Space that nobody sees is worth a little, since parts do go there (the sides
+    of a drawer); free space costs −1.
     """
     voxel = float((high - low).max()) / cells
     shape = np.ceil((high - low) / voxel).astype(int) + 1
@@ -57,7 +61,7 @@ def score_volume(
     distance, nearest = distance_transform_edt(count == 0, return_indices=True)
     near = tuple(nearest)
     score = occupied[near] * np.exp(-0.5 * np.maximum(distance - 0.5, 0) ** 2)
-    score = np.where((views_free >= 3) & (distance > 1.5), -1.0, score)
+    score = np.where(distance > 1.5, np.where(views_free >= 3, -1.0, HIDDEN_SCORE), score)
     return ScoreVolume(low, voxel, score.astype(np.float32), np.ascontiguousarray(colour[near]))
 
 
@@ -66,6 +70,9 @@ def novelty(answer: np.ndarray) -> np.ndarray:
     new = answer[:, FREE] >= 3
     seen = answer[:, SURFACE] >= 2
     return np.where(new, 1.0, np.where(seen, 0.15, 0.6)).astype(np.float32)
+
+
+HIDDEN32 = np.float32(HIDDEN_SCORE)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
@@ -84,7 +91,9 @@ def _sum(q, colours, shift, origin, inverse_voxel, score, volume_colour, give_up
             penalty -= 1
         else:
             s = score[x, y, z]
-            if s > 0:
+            if s == HIDDEN32:
+                penalty += s
+            elif s > 0:
                 e0 = volume_colour[x, y, z, 0] - colours[i, 0]
                 e1 = volume_colour[x, y, z, 1] - colours[i, 1]
                 e2 = volume_colour[x, y, z, 2] - colours[i, 2]

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from hingesplat.capture import View
 from hingesplat.gaussians import SH_C0, Gaussians
-from hingesplat.search import COLOUR_SCALE, Motion, ScoreVolume, scan, score_volume
+from hingesplat.search import Motion, ScoreVolume, scan, score_volume
 from hingesplat.visibility import COLOUR, FREE, HIDDEN, SURFACE, Sight, ask, look
 
 
@@ -33,7 +33,9 @@ class SegmentConfig:
     """Voxels along the object's longest side in the coarse search."""
     seeds_per_search: int = 160
     """Seeds moved in one search."""
-    explained_cost: float = 0.65
+    max_seeds: int = 1200
+    """Seeds of each state that judge the hypotheses."""
+    explained_cost: float = 0.8
     """A seed that a motion explains worse than this counts as unexplained."""
     part_cost: float = 25.0
     """Description length of one more part, in seeds (a seed stands for 0.012² of the extent's square)."""
@@ -56,6 +58,9 @@ class Surface:
     index: np.ndarray
     """(n,) rows of the state's Gaussians."""
     sight: Sight
+
+    def rows(self, index: np.ndarray) -> "Surface":
+        return replace(self, points=self.points[index], colours=self.colours[index], index=self.index[index])
 
 
 @dataclass(frozen=True)
@@ -99,7 +104,7 @@ def thin(points: np.ndarray, size: float, rng: np.random.Generator) -> np.ndarra
     """Indices of one random point in each occupied cube of the given size, so that area counts, not texture."""
     order = rng.permutation(len(points))
     _, first = np.unique(np.floor(points[order] / size).astype(np.int64), axis=0, return_index=True)
-    return order[np.sort(first)]
+    return order[rng.permutation(first)]
 
 
 def components(points: np.ndarray, radius: float) -> np.ndarray:
@@ -148,20 +153,6 @@ def moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
     return points @ T[:3, :3].T + T[:3, 3]
 
 
-def seed_costs(points: np.ndarray, colours: np.ndarray, motion: Motion, volume: ScoreVolume) -> np.ndarray:
-    """(n,) in [0, 2]: how badly the other state receives each seed; 0 is a new surface of the same colour."""
-    q = np.round((moved(points, motion.T) - volume.origin) / volume.voxel).astype(int)
-    inside = ((q >= 0) & (q < volume.score.shape)).all(1)
-    q = np.where(inside[:, None], q, 0)
-    at = tuple(q.T)
-    score = np.where(inside, volume.score[at], -1.0)
-    difference = volume.colour[at] - colours
-    weight = np.maximum(score, 0)[:, None]
-    difference = difference - 0.8 * (weight * difference).sum(0) / max(weight.sum(), 1e-6)
-    alike = 1 / (1 + (difference**2).sum(1) / COLOUR_SCALE**2)
-    return 1 - np.where(score > 0, score * alike, score)
-
-
 def select_motions(costs: np.ndarray, config: SegmentConfig, parts: int | None) -> list[int]:
     """Greedy choice of the hypotheses (columns) that explain the seeds (rows) at the least description length.
 
@@ -208,7 +199,7 @@ def refine_motion(
 
 
 def label_costs(
-    surface: Surface, other: Sight, motions: Sequence[Motion], *, forward: bool
+    surface: Surface, other: Sight, motions: Sequence[Motion], *, forward: bool, hidden_cost: float = 0.25
 ) -> np.ndarray:
     """(n, 1 + motions) cost of each label for each surface point, from the other state's photographs alone."""
     columns = []
@@ -221,7 +212,7 @@ def label_costs(
         free, seen, hidden = answer[:, FREE] / views, answer[:, SURFACE] / views, answer[:, HIDDEN] / views
         contradiction = np.clip(free / 0.25, 0, 1)
         colour = np.clip((answer[:, COLOUR] - 0.05) / 0.5, 0, 1) * seen / np.maximum(seen + hidden, 1e-6)
-        columns.append(contradiction + 0.5 * colour + 0.25 * hidden + (0.0 if motion is None else 0.1))
+        columns.append(contradiction + 0.5 * colour + hidden_cost * hidden + (0.0 if motion is None else 0.1))
     return np.stack(columns, 1)
 
 
@@ -359,13 +350,14 @@ def segment(
         empty = (np.zeros(len(gaussians[0]), int), np.zeros(len(gaussians[1]), int))
         return Segmentation(empty, (), 0.0, n_seeds)
 
+    judges = [s.rows(i[: config.max_seeds]) for s, i in zip(surfaces, seeds, strict=True)]
+
     def costs_of(candidates: Sequence[Motion]) -> np.ndarray:
-        blocks = []
-        for s in (0, 1):
-            p, c = surfaces[s].points[seeds[s]], surfaces[s].colours[seeds[s]]
-            directed = candidates if s == 0 else [inverted(m) for m in candidates]
-            blocks.append(np.stack([seed_costs(p, c, m, fine[1 - s]) for m in directed], 1))
-        return np.concatenate(blocks)
+        """(seeds, candidates) what the other state's cameras say of every seed under every candidate."""
+        pairs = ((judges[0], sights[1], True), (judges[1], sights[0], False))
+        return np.concatenate(
+            [label_costs(j, o, candidates, forward=f, hidden_cost=0.5)[:, 1:] for j, o, f in pairs]
+        )
 
     chosen = [pool[k] for k in select_motions(costs_of(pool), config, parts)]
     problem = Labelling.of(surfaces, extent)
@@ -373,11 +365,11 @@ def segment(
     for round_ in range(config.rounds):
         chosen = [
             _refit(m, own, surfaces, fine, 6.0 / 2**round_, config, rng)
-            for m, own in _owners(chosen, costs_of(chosen), seeds, config, owned if round_ else None)
+            for m, own in _owners(chosen, costs_of(chosen), [s[: config.max_seeds] for s in seeds], config, owned if round_ else None)
         ]
         chosen, owned = problem.solve(chosen, config.part_cost * 2, parts)
     chosen, owned = split_pieces(chosen, owned, surfaces, extent, config)
-    costs = costs_of(chosen) if chosen else np.ones((n_seeds, 1))
+    costs = costs_of(chosen) if chosen else np.ones((1, 1))
     unexplained = float((costs.min(1) >= config.explained_cost).mean())
     labels = tuple(spread_labels(gaussians[s].means.numpy(), surfaces[s], owned[s]) for s in (0, 1))
     return Segmentation((labels[0], labels[1]), tuple(chosen), unexplained, n_seeds)

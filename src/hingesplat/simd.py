@@ -17,12 +17,12 @@ from pathlib import Path
 from typing import Any
 
 import llvmlite.ir as ir
+import numba.extending
 from numba.core import cgutils, event, types
 from numba.core.registry import cpu_target
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import (
     NativeValue,
-    intrinsic,
     lower_builtin,
     models,
     register_model,
@@ -35,8 +35,10 @@ import hingesplat
 
 logger = logging.getLogger("hingesplat")
 
+intrinsic: Any = numba.extending.intrinsic  # it drops the first parameter, which a type checker cannot know
 
-# ---- compiling, caching, threads ----------------------------------------------------------------------------
+
+# ---- compiling, caching, threads -----------------------------------------------------------------------
 
 # Without "nnan" and "ninf": comparisons must still reject what is not finite.
 FAST_MATH = ("nsz", "arcp", "contract", "reassoc", "afn")
@@ -44,14 +46,15 @@ FAST_MATH = ("nsz", "arcp", "contract", "reassoc", "afn")
 KERNEL: dict[str, Any] = dict(cache=True, nogil=True, error_model="numpy", fastmath=set(FAST_MATH))
 """Options of a kernel that Python calls: cached on disk, GIL released."""
 INNER: dict[str, Any] = dict(_nrt=False, nogil=True, error_model="numpy", fastmath=set(FAST_MATH))
-"""Options of a function that only kernels call. It must not allocate: without ``_nrt=False``, every call would count
+"""Options of a function that only kernels call. It must not allocate: without ``_nrt=False``, every call
+would count
 references to its arrays with atomic operations, which costs more than most of these functions do."""
 INLINE: dict[str, Any] = dict(INNER, forceinline=True)
 """Options of a small function that must melt into its caller."""
 
 
 def _target_lanes() -> int:
-    _, _, features = cpu_target.target_context.codegen().magic_tuple()
+    _, _, features = cpu_target.target_context.codegen().magic_tuple()  # pyright: ignore[reportAttributeAccessIssue]
     return 16 if "+avx512f" in features.split(",") else 8
 
 
@@ -63,8 +66,8 @@ class Build:
 
     Numba's disk cache sees neither changed globals nor edits of imported modules. The type of this token
     does: it names the package version, the number of lanes and a digest of the source files given, so code of
-    another build is never loaded. ``planes`` is a compile-time number of image planes, for the kernels that are
-    specialised on it.
+    another build is never loaded. ``planes`` is a compile-time number of image planes, for the kernels that
+    are specialised on it.
     """
 
     def __init__(self, sources: Iterable[Path], planes: int = 0):
@@ -147,7 +150,7 @@ def parallel(kernel: Callable[..., Any], threads: int, *args: Any) -> None:
         other.result()
 
 
-# ---- the vector type ----------------------------------------------------------------------------------------
+# ---- the vector type -----------------------------------------------------------------------------------
 
 _F32, _I32, _I64, _BIT = ir.FloatType(), ir.IntType(32), ir.IntType(64), ir.IntType(1)
 _VECTOR, _INTS = ir.VectorType(_F32, LANES), ir.VectorType(_I32, LANES)
@@ -225,7 +228,7 @@ def _emit_store(builder, value, pointer):
     builder.store(value, builder.bitcast(pointer, _VECTOR.as_pointer()), align=4)
 
 
-# ---- scalars ------------------------------------------------------------------------------------------------
+# ---- scalars -------------------------------------------------------------------------------------------
 
 
 @intrinsic
@@ -271,14 +274,14 @@ def float_bits(typingctx, x):
     return types.int64(types.float32), code
 
 
-# ---- vectors ------------------------------------------------------------------------------------------------
+# ---- vectors -------------------------------------------------------------------------------------------
 
 
 def _arithmetic(operation, instruction):
     """Let the Python operator work on (vector, vector), (vector, scalar) and (scalar, vector)."""
     kinds = ((vector, vector), (vector, types.float32), (types.float32, vector))
 
-    @infer_global(operation)
+    @infer_global(operation)  # pyright: ignore[reportOptionalCall]
     class _Typing(ConcreteTemplate):
         cases = [signature(vector, *kind) for kind in kinds]  # noqa: RUF012
 
@@ -360,7 +363,7 @@ def vscatter(typingctx, array, base, stride, value):
         pointer, stride = _pointer(context, builder, sig, args, 0), _index(context, builder, sig, args, 2)
         lanes, element = args[3], sig.args[0].dtype
         if isinstance(element, types.Integer):
-            lanes = builder.fptosi(lanes, ir.VectorType(ir.IntType(element.bitwidth), LANES))
+            lanes = builder.fptosi(lanes, ir.VectorType(context.get_value_type(element), LANES))
         for lane in range(LANES):
             builder.store(builder.extract_element(lanes, _I32(lane)), pointer)
             pointer = builder.gep(pointer, [stride])
@@ -496,7 +499,7 @@ def vmantissa(typingctx, x):
     return vector(vector), code
 
 
-# ---- several planes at once: tuples of ``build.planes`` vectors, kept in registers --------------------------
+# ---- several planes at once: tuples of ``build.planes`` vectors, kept in registers ---------------------
 
 
 def _planes(context, builder, sig, args, k):

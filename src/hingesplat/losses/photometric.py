@@ -1,7 +1,9 @@
-"""The photometric loss of 3D Gaussian Splatting, (1 - w)·L1 + w·(1 - SSIM), and the measures of image quality.
+"""The photometric loss of 3D Gaussian Splatting, (1 - w)·L1 + w·(1 - SSIM), and the measures of image
+quality.
 
-SSIM after Wang et al. 2004: an 11×11 Gaussian window with σ = 1.5, zero padding, data range 1, per channel. On the
-CPU a fused kernel computes loss and gradient at once, some fifteen times faster than convolutions in torch.
+SSIM after Wang et al. 2004: an 11×11 Gaussian window with σ = 1.5, zero padding, data range 1, per channel.
+On the CPU a fused kernel computes loss and gradient at once, some fifteen times faster than convolutions in
+torch.
 """
 
 from dataclasses import dataclass
@@ -63,7 +65,8 @@ class Target:
 
 
 def photometric(image: Tensor, target: Target, ssim_weight: float = 0.2) -> Tensor:
-    """(1 - w)·mean |image - target| + w·(1 - mean SSIM), a scalar; differentiable in ``image`` (C, height, width).
+    """(1 - w)·mean |image - target| + w·(1 - mean SSIM), a scalar; differentiable in ``image`` (C, height,
+    width).
 
     Raises:
         ValueError: the shapes differ.
@@ -111,10 +114,10 @@ def _ssim_map(x: Tensor, target: Target) -> Tensor:
 
 # ---- the fused kernel ------------------------------------------------------------------------------------
 #
-# With μ, e, f the window averages of x, x², x·y, SSIM is a function of (μ, e - μ², f - μ·μ_y) at every pixel. Rows
-# stream through three steps: average along the row; average down the columns and differentiate SSIM; average these
-# derivatives likewise (the window is its own transpose) and add up the gradient. Every step lags the one before by
-# five rows.
+# With μ, e, f the window averages of x, x², x·y, SSIM is a function of (μ, e - μ², f - μ·μ_y) at every
+# pixel. Rows stream through three steps: average along the row; average down the columns and differentiate
+# SSIM; average these derivatives likewise (the window is its own transpose) and add up the gradient. Every
+# step lags the one before by five rows.
 
 _BUILD = Build([Path(__file__)])
 _W0, _W1, _W2, _W3, _W4, _W5 = (np.float32(w) for w in _WINDOW[RADIUS:])
@@ -296,7 +299,8 @@ def _stream(
 
 @njit(**KERNEL)
 def _loss_and_gradient(build, x, y, mean, variance, size, weight, sums, gradient, t, threads):
-    """Every channel is cut into as many bands as there are threads; thread t does every so many-th of them."""
+    """Every channel is cut into as many bands as there are threads; thread t does every so many-th of
+    them."""
     channels, height, width = size
     n = channels * height * width
     l1_scale, ssim_scale = np.float32((1 - weight) / n), np.float32(-weight / n)

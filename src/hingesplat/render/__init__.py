@@ -56,9 +56,11 @@ def rasterize(
         background: (3,) rgb behind everything; black if None. It shows in ``rgb`` only.
         backend: None takes ``gsplat`` for CUDA tensors, ``numba`` for float32 and ``torch`` for other types.
         early_stop: end a pixel once its transmittance has fallen to 1e-4.
-        screen_gradient: (n, 3) float statistics that the backward pass updates for every visible Gaussian: column 0
-            grows by |d loss / d (projected mean)| (per pixel), column 1 by one, and column 2 becomes the largest
-            radius so far (pixels; half the longer side of the box outside which its alpha is below 1/255).
+        screen_gradient: (n, 3) float statistics that the backward pass updates for every visible Gaussian:
+        column 0
+            grows by |d loss / d (projected mean)| (per pixel), column 1 by one, and column 2 becomes the
+            largest radius so far (pixels; half the longer side of the box outside which its alpha is below
+            1/255).
 
     Raises:
         HingesplatError: the backend cannot work on these tensors.
@@ -94,7 +96,7 @@ def _default_backend(means: Tensor) -> Backend:
 
 
 def render(gaussians: Gaussians, camera: Camera, **options) -> Rendering:
-    """Evaluate the spherical harmonics of ``gaussians`` towards the camera, then ``rasterize`` with the options."""
+    """Colour ``gaussians`` as the camera sees them, then ``rasterize`` with the same options."""
     centre = torch.as_tensor(camera.centre).to(gaussians.means)
     directions = torch.nn.functional.normalize(gaussians.means - centre, dim=1)
     return rasterize(
@@ -109,10 +111,10 @@ def render(gaussians: Gaussians, camera: Camera, **options) -> Rendering:
 
 
 def sh_to_rgb(sh: Tensor, directions: Tensor) -> Tensor:
-    """Colour of spherical harmonics (n, (degree + 1)², 3), degree 0 to 3, seen along unit ``directions`` (n, 3).
+    """Colour (n, 3) of spherical harmonics (n, (degree + 1)², 3) of degree 0 to 3: 0.5 + Σ basis·sh, at least 0.
 
-    Directions point from the camera to the Gaussian. Real harmonics in the order and with the signs of the 3DGS file
-    format (Kerbl et al. 2023): m = -l … l, with the Condon-Shortley phase. Returns (n, 3): 0.5 + Σ basis·sh, at least 0.
+    ``directions`` (n, 3) are unit vectors from the camera to the Gaussians. The harmonics are real, in the order
+    and with the signs of the 3DGS file format (Kerbl et al. 2023): m = -l … l, with the Condon-Shortley phase.
     """
     basis = _sh_basis(directions, sh.shape[1])
     return (0.5 + torch.einsum("nb,nbc->nc", basis, sh)).clamp(min=0)

@@ -1,7 +1,7 @@
 """The pixel loops: blending of the tiles' work lists, forward and backward.
 
-A thread holds one tile at a time in a small buffer of planes. A plane has LANES spare columns and one spare row, so
-that a segment may start at any column and rows go two at a time; the spare pixels have transmittance 0.
+A thread holds one tile at a time in a small buffer of planes. A plane has LANES spare columns and one spare
+row, so that a segment may start at any column and rows go two at a time; spare pixels have transmittance 0.
 """
 
 import math
@@ -195,8 +195,7 @@ def blend(
 
 @njit(**INNER)
 def _load_plane(plane, x0, y0, x1, y1, width, image, i, gradient, j, buffer):
-    """An image plane (at image[i]) and its gradient (at gradient[j]): the gradient to the buffer, and gradient
-    times image on top of the rest."""
+    """The gradient of an image plane (at gradient[j]) to the buffer; times the plane (at image[i]) to the rest."""
     for r in range(y1 - y0 + 1):
         p, b, c = (y0 + r) * width + x0, r * PITCH, 0
         while c + LANES <= x1 - x0 + 1:
@@ -215,8 +214,8 @@ def _load_plane(plane, x0, y0, x1, y1, width, image, i, gradient, j, buffer):
 def _load_tile(build, x0, y0, x1, y1, width, height, image, g_image, buffer):
     """Planes: transmittance, rest, gradients of alpha and of the features.
 
-    The *rest* is Σ gradient·image over all planes: what the Gaussians not yet passed, and the background, still
-    add to the linearised loss.
+    The *rest* is Σ gradient·image over all planes: what the Gaussians not yet passed, and the background,
+    still add to the linearised loss.
     """
     g_colors, g_channels, g_depth, g_alpha = g_image
     area, zero = width * height, vsplat(_0)

@@ -1,8 +1,9 @@
 """Projection of 3D Gaussians to the image and back: SIMD kernels, LANES Gaussians at a time.
 
-All arrays are flat. ``view`` holds what ``View`` names; a *record* is what the pixel loops need to know of one
-projected Gaussian: the fields of ``_tiles``, then its colours, its channels, its depth, and zeros up to the planes drawn.
-Blocks overlap at the end instead of being cut short, so at least LANES Gaussians are needed.
+All arrays are flat. ``view`` holds what ``View`` names; a *record* is what the pixel loops need to know of
+one projected Gaussian: the fields of ``_tiles``, then its colours, its channels, its depth, and zeros up to
+the planes drawn. Blocks overlap at the end instead of being cut short, so at least LANES Gaussians are
+needed.
 """
 
 import math
@@ -63,8 +64,8 @@ class View(IntEnum):
     SIZE = 23
 
 
-# Fields of the sums that the backward pass over the pixels leaves: v = d loss / d log(alpha), summed over pixels as
-# v, v·dx, v·dx², v·dy, v·dx·dy, v·dy²; then d loss / d feature.
+# Fields of the sums that the backward pass over the pixels leaves: v = d loss / d log(alpha), summed over
+# pixels as v, v·dx, v·dx², v·dy, v·dx·dy, v·dy²; then d loss / d feature.
 SUM_1, SUM_X, SUM_XX, SUM_Y, SUM_XY, SUM_YY, SUM_FEATURES = 0, 1, 2, 3, 4, 5, 6
 
 _R, _T, _FX, _FY, _CX, _CY = int(View.R), int(View.T), int(View.FX), int(View.FY), int(View.CX), int(View.CY)
@@ -177,7 +178,8 @@ def _half_covariance(G, R, s):
 def _covariance(B):
     """Entries 00, 01, 11 of B Bᵀ + blur, and its determinant.
 
-    The determinant sums squared minors (Cauchy-Binet); c00·c11 - c01² would cancel to noise for thin Gaussians.
+    The determinant sums squared minors (Cauchy-Binet); c00·c11 - c01² would cancel to noise for thin
+    Gaussians.
     """
     b00, b01, b02, b10, b11, b12 = B
     t00 = b00 * b00 + b01 * b01 + b02 * b02
@@ -189,7 +191,8 @@ def _covariance(B):
 
 @njit(**INNER)
 def _project_block(i, means, quats, scales, opacities, view, record, stride, boxes):
-    """Gaussians i … i + LANES - 1 to the geometric fields of their records and to pixel boxes (x0, x1, y0, y1)."""
+    """Gaussians i … i + LANES - 1 to the geometric fields of their records and to pixel boxes (x0, x1, y0,
+    y1)."""
     x, y, z = _in_camera(i, means, view)
     o = vload(opacities, i)
     visible = vand(vgt(z, view[_NEAR]), vgt(o, _ALPHA_MIN))

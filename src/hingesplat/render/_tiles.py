@@ -1,8 +1,9 @@
 """Which Gaussian touches which part of the image: depth order and the work lists of the tiles.
 
-The image is cut into tiles. Within a tile the columns that a Gaussian covers are cut into *segments* of at most LANES
-columns, starting at the Gaussian's left edge; a segment with its rows is one unit of work for the pixel loops. Each
-segment owns a slot for its gradient sums; the slots of one Gaussian lie side by side, so no atomics are needed.
+The image is cut into tiles. Within a tile the columns that a Gaussian covers are cut into *segments* of at
+most LANES columns, starting at the Gaussian's left edge; a segment with its rows is one unit of work for the
+pixel loops. Each segment owns a slot for its gradient sums; the slots of one Gaussian lie side by side, so
+no atomics are needed.
 """
 
 import math
@@ -13,8 +14,8 @@ from numba import njit
 from hingesplat.render.torch_backend import ALPHA_MIN
 from hingesplat.simd import INLINE, INNER, KERNEL, LANES, float_bits, sload, sstore
 
-# Fields of a record. log2(alpha) = LOG_OPACITY + A·dx² + B·dx·dy + C·dy², with d = pixel centre - (X, Y); EXTENT are the
-# half sides of the box outside which alpha is below its threshold.
+# Fields of a record. log2(alpha) = LOG_OPACITY + A·dx² + B·dx·dy + C·dy², with d = pixel centre - (X, Y);
+# EXTENT are the half sides of the box outside which alpha is below its threshold.
 REC_X, REC_Y, REC_A, REC_B, REC_C, REC_LOG_OPACITY = 0, 1, 2, 3, 4, 5
 REC_EXTENT_X, REC_EXTENT_Y, REC_DEPTH, REC_FEATURES = 6, 7, 8, 9
 
@@ -56,8 +57,8 @@ def count_segments(first, last, boxes, segments, histogram, width):
 def sort_and_offset(build, segments, record, stride, histogram, order, scratch, offsets, starts):
     """Sort the visible Gaussians by depth (stable, exact) into ``order``; lay out slots and tile lists.
 
-    ``offsets`` (n + 1,) are the first slots of the Gaussians, ``starts`` (tiles + 1,) the first list entries of
-    the tiles. Returns the numbers of visible Gaussians and of segments.
+    ``offsets`` (n + 1,) are the first slots of the Gaussians, ``starts`` (tiles + 1,) the first list entries
+    of the tiles. Returns the numbers of visible Gaussians and of segments.
     """
     n, visible, total = segments.shape[0], 0, 0
     low, high = np.int64(2**31), np.int64(0)
@@ -104,8 +105,8 @@ def sort_and_offset(build, segments, record, stride, histogram, order, scratch, 
 def _slab(a, b, c, spread, reach_x, reach_y, xa, xb):
     """Lowest and highest dy at which the ellipse a·dx² + b·dx·dy + c·dy² = -spread meets xa ≤ dx ≤ xb.
 
-    ``reach`` are the half sides of its box. The bounds are those of the ellipse's extreme points where these lie in
-    the interval, else of the nearer end of the interval.
+    ``reach`` are the half sides of its box. The bounds are those of the ellipse's extreme points where these
+    lie in the interval, else of the nearer end of the interval.
     """
     a, b, c = -a, -_HALF * b, -c
     topmost = -b * reach_y / a  # dx of the topmost point
@@ -141,8 +142,8 @@ def _list_segments(g, box, row0, row1, columns, record, stride, slot0, cursor, b
         for x in range(max(x0, column * TILE), end + 1, LANES):
             left, right = np.float32(x) + _HALF - mx, np.float32(min(x + LANES - 1, end)) + _HALF - mx
             bottom, top = _slab(a, b, c, spread, reach_x, reach_y, left, right)
-            low = max(y0, int(math.ceil(my + bottom - _HALF)))
-            high = min(y1, int(math.floor(my + top - _HALF)))
+            low = max(y0, math.ceil(my + bottom - _HALF))
+            high = min(y1, math.floor(my + top - _HALF))
             for row in range(max(first_row, row0), min(last_row + 1, row1)):
                 start = max(low, row * TILE)
                 rows = max(min(high, row * TILE + TILE - 1) - start + 1, 0)
@@ -161,7 +162,8 @@ def _list_segments(g, box, row0, row1, columns, record, stride, slot0, cursor, b
 def fill_lists(
     build, visible, order, boxes, record, stride, offsets, starts, columns, items, slots, shapes, t, threads
 ):
-    """Write the lists of the tiles, front to back; thread t does the tile rows that hold its share of the work."""
+    """Write the lists of the tiles, front to back; thread t does the tile rows that hold its share of the
+    work."""
     rows = (starts.shape[0] - 1) // columns
     total = starts[rows * columns]
     row0 = 0

@@ -1,7 +1,9 @@
-"""The CPU engine: projection, depth sort, tile lists and pixel loops as cached Numba kernels with explicit SIMD.
+"""The CPU engine: projection, depth sort, tile lists and pixel loops as cached Numba kernels with explicit
+SIMD.
 
-The kernels live in ``_project``, ``_tiles`` and ``_blend``; this file allocates, runs them on threads, and gives
-them to autograd. Nothing is shared between calls, so any number of forward passes may wait for their backward.
+The kernels live in ``_project``, ``_tiles`` and ``_blend``; this file allocates, runs them on threads, and
+gives them to autograd. Nothing is shared between calls, so any number of forward passes may wait for their
+backward.
 """
 
 from dataclasses import dataclass
@@ -25,7 +27,8 @@ from hingesplat.render.torch_backend import (
 from hingesplat.simd import LANES, Build, parallel
 
 CHANNEL_SIZES = (0, 1, 4, 8, 16)
-"""Numbers of channels that kernels are compiled for; others are padded up, and more are drawn in several passes."""
+"""Numbers of channels that kernels are compiled for; others are padded up, and more are drawn in several
+passes."""
 
 GAUSSIANS_PER_THREAD = 1024
 """With fewer, another thread costs more than it brings."""
@@ -124,7 +127,8 @@ def _draw(
     background: np.ndarray,
     early_stop: bool,
 ) -> tuple[_State, np.ndarray]:
-    """Draw to ``state.image`` (3 + C + 2, height, width): colours, channels, depth, alpha; and who was visible."""
+    """Draw to ``state.image`` (3 + C + 2, height, width): colours, channels, depth, alpha; and who was
+    visible."""
     n, count = channels.shape
     planes = next(size for size in CHANNEL_SIZES if size >= count) + 4  # colours and depth
     build, view = _BUILD.with_planes(planes), _view(camera)

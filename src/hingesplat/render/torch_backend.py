@@ -1,12 +1,16 @@
-"""The definition of the rasteriser: brute force over all pixels and Gaussians, in plain torch, in any float type.
+"""The definition of the rasteriser: brute force over all pixels and Gaussians, in plain torch, in any float
+type.
 
 Conventions are those of gsplat 1.5.3 (Apache-2.0), stated here in our own words:
 
-* EWA projection: Σ' = J W Σ Wᵀ Jᵀ + 0.3·I (pixels²), J taken at the centre clamped to 1.3 times the field of view;
-* α = min(0.999, o·exp(-½ dᵀ Σ'⁻¹ d)), d from the pixel centre (+0.5) to the projected mean; α < 1/255 counts as 0;
+* EWA projection: Σ' = J W Σ Wᵀ Jᵀ + 0.3·I (pixels²), J taken at the centre clamped to 1.3 times the field of
+  view;
+* α = min(0.999, o·exp(-½ dᵀ Σ'⁻¹ d)), d from the pixel centre (+0.5) to the projected mean; α < 1/255 counts
+  as 0;
 * front to back by the depth of the centres, ties by index; what lies nearer than 0.01 is not drawn;
-* with ``early_stop``, a pixel takes nothing more once its transmittance is at most 1e-4. (gsplat moreover drops the
-  Gaussian that would bring it there. We keep it: dropping it can cost a tenth of the light of a pixel.)
+* with ``early_stop``, a pixel takes nothing more once its transmittance is at most 1e-4. (gsplat moreover
+  drops the Gaussian that would bring it there. We keep it: dropping it can cost a tenth of the light of a
+  pixel.)
 """
 
 import torch
@@ -136,8 +140,8 @@ def rasterize(
 def record_screen_gradient(statistics: Tensor, seen: Tensor, gradient: Tensor, radius: Tensor) -> None:
     """Update the densification statistics (n, 3) of the Gaussians with indices ``seen`` (m,).
 
-    Column 0 grows by the length of the pixel-space ``gradient`` (m, 2), column 1 by one, and column 2 is the largest
-    ``radius`` (m,) so far.
+    Column 0 grows by the length of the pixel-space ``gradient`` (m, 2), column 1 by one, and column 2 is the
+    largest ``radius`` (m,) so far.
     """
     statistics[seen, 0] += gradient.norm(dim=1).to(statistics.dtype)
     statistics[seen, 1] += 1
