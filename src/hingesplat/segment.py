@@ -37,7 +37,7 @@ class SegmentConfig:
     """Seeds of each state that judge the hypotheses."""
     explained_cost: float = 0.8
     """A seed that a motion explains worse than this counts as unexplained."""
-    part_cost: float = 25.0
+    part_cost: float = 10.0
     """Description length of one more part, in seeds (a seed stands for 0.012² of the extent's square)."""
     min_part_seeds: int = 25
     """A part must own at least this many seeds."""
@@ -189,13 +189,18 @@ def refine_motion(
     u = np.cross(motion.axis, helper)
     u /= np.linalg.norm(u)
     w = np.cross(motion.axis, u)
-    directions = np.array([motion.axis + tilt * (a * u + b * w) for a in (-1, 0, 1) for b in (-1, 0, 1)])
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    tilted = np.array(
+        [motion.axis + tilt * (a * u + b * w) for a in (-1, 0, 1) for b in (-1, 0, 1) if a or b]
+    )
+    tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
     values = motion.value + np.linspace(-1, 1, 9) * (
         np.radians(spread_deg) if motion.kind == "revolute" else 2 * volume.voxel
     )
-    found = scan(points, colours, directions, volume, kinds=(motion.kind,), values=values, near=motion, keep=1)
-    return found[0] if found else motion
+    kinds = (motion.kind,)
+    (straight,) = scan(points, colours, motion.axis[None], volume, kinds=kinds, values=values, near=motion, keep=1)
+    (best,) = scan(points, colours, tilted, volume, kinds=kinds, values=values, near=motion, keep=1)
+    # The volume is coarse: an axis is tilted only for a clear gain, and the photographs settle the rest later.
+    return best if best.score > straight.score + 0.02 else straight
 
 
 def label_costs(
@@ -204,15 +209,16 @@ def label_costs(
     """(n, 1 + motions) cost of each label for each surface point, from the other state's photographs alone."""
     columns = []
     for motion in [None, *motions]:
-        points = surface.points
+        points, travel = surface.points, 0.0
         if motion is not None:
             points = moved(points, motion.T if forward else np.linalg.inv(motion.T))
+            travel = np.linalg.norm(points - surface.points, axis=1)
         answer = ask(points, surface.colours, other)
         views = np.maximum(answer[:, : HIDDEN + 1].sum(1), 1)
         free, seen, hidden = answer[:, FREE] / views, answer[:, SURFACE] / views, answer[:, HIDDEN] / views
         contradiction = np.clip(free / 0.25, 0, 1)
         colour = np.clip((answer[:, COLOUR] - 0.05) / 0.5, 0, 1) * seen / np.maximum(seen + hidden, 1e-6)
-        columns.append(contradiction + 0.5 * colour + hidden_cost * hidden + (0.0 if motion is None else 0.1))
+        columns.append(contradiction + 0.5 * colour + hidden_cost * hidden + (0.0 if motion is None else 0.1 + 0.1 * travel))
     return np.stack(columns, 1)
 
 
@@ -444,13 +450,15 @@ def propose(
     for s, group in groups:
         chosen = rng.choice(group, min(config.seeds_per_search, len(group)), replace=False)
         p, c = surfaces[s].points[chosen], surfaces[s].colours[chosen]
-        found = scan(p, c, directions, coarse[1 - s], keep=4)
-        for motion in found:
-            if motion.score > max(0.1, 0.6 * found[0].score):
-                # Compare hypotheses at their best: on the grid a true one may be 3° off and lose to a lucky one.
-                for spread in (4.0, 1.5):
-                    motion = refine_motion(motion, p, c, fine[1 - s], spread)
-                pool.append(motion if s == 0 else inverted(motion))
+        # Slides get a hearing of their own: with three numbers fewer they are seldom the luckiest fit.
+        for kind in ("revolute", "prismatic"):
+            found = scan(p, c, directions, coarse[1 - s], kinds=(kind,), keep=3)
+            for motion in found:
+                if motion.score > max(0.1, 0.7 * found[0].score):
+                    # Compare hypotheses at their best: on the grid a true one may be 3° off and lose to a lucky one.
+                    for spread in (4.0, 1.5):
+                        motion = refine_motion(motion, p, c, fine[1 - s], spread)
+                    pool.append(motion if s == 0 else inverted(motion))
     return pool
 
 

@@ -46,9 +46,8 @@ FAST_MATH = ("nsz", "arcp", "contract", "reassoc", "afn")
 KERNEL: dict[str, Any] = dict(cache=True, nogil=True, error_model="numpy", fastmath=set(FAST_MATH))
 """Options of a kernel that Python calls: cached on disk, GIL released."""
 INNER: dict[str, Any] = dict(_nrt=False, nogil=True, error_model="numpy", fastmath=set(FAST_MATH))
-"""Options of a function that only kernels call. It must not allocate: without ``_nrt=False``, every call
-would count
-references to its arrays with atomic operations, which costs more than most of these functions do."""
+"""Options of a function that only kernels call. It must not allocate: without ``_nrt=False`` every call
+would count references to its arrays with atomic operations, at more cost than most of them have."""
 INLINE: dict[str, Any] = dict(INNER, forceinline=True)
 """Options of a small function that must melt into its caller."""
 
@@ -109,7 +108,7 @@ class _CompileNotice(event.Listener):
     def on_start(self, event):
         if event.data["dispatcher"].py_func.__module__.startswith("hingesplat."):
             _forget_notice()
-            logger.info("compiling the CPU rasteriser (once, about 30 s) ...")
+            logger.info("compiling the CPU rasteriser (once, about 20 s) ...")
 
     def on_end(self, event):
         pass

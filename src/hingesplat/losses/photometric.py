@@ -1,9 +1,7 @@
-"""The photometric loss of 3D Gaussian Splatting, (1 - w)·L1 + w·(1 - SSIM), and the measures of image
-quality.
+"""The photometric loss of 3D Gaussian Splatting (Kerbl et al. 2023, eq. 7) and the measures of image quality.
 
 SSIM after Wang et al. 2004: an 11×11 Gaussian window with σ = 1.5, zero padding, data range 1, per channel.
-On the CPU a fused kernel computes loss and gradient at once, some fifteen times faster than convolutions in
-torch.
+On the CPU a fused kernel computes loss and gradient at once, many times faster than convolutions in torch.
 """
 
 from dataclasses import dataclass
@@ -65,8 +63,7 @@ class Target:
 
 
 def photometric(image: Tensor, target: Target, ssim_weight: float = 0.2) -> Tensor:
-    """(1 - w)·mean |image - target| + w·(1 - mean SSIM), a scalar; differentiable in ``image`` (C, height,
-    width).
+    """(1 - w)·mean |image - target| + w·(1 - mean SSIM) of ``image`` (C, height, width); differentiable.
 
     Raises:
         ValueError: the shapes differ.
@@ -76,12 +73,12 @@ def photometric(image: Tensor, target: Target, ssim_weight: float = 0.2) -> Tens
     if image.device.type == "cpu" and image.dtype == torch.float32 and image.numel():
         return _Fused.apply(image, target, ssim_weight)
     l1 = (image - target.image).abs().mean()
-    return (1 - ssim_weight) * l1 + ssim_weight * (1 - _ssim_map(image, target).mean())
+    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim_map(image, target).mean())
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:
     """Mean structural similarity of two images (C, height, width): 1 when they are equal."""
-    return _ssim_map(a, Target.of(b)).mean()
+    return ssim_map(a, Target.of(b)).mean()
 
 
 def psnr(a: Tensor, b: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -103,7 +100,8 @@ def _blur(image: Tensor) -> Tensor:
     return torch.nn.functional.conv2d(image[None], kernel, padding=RADIUS, groups=len(image))[0]
 
 
-def _ssim_map(x: Tensor, target: Target) -> Tensor:
+def ssim_map(x: Tensor, target: Target) -> Tensor:
+    """Structural similarity at every pixel, (C, height, width), by convolutions in torch."""
     mean = _blur(x)
     variance = _blur(x * x) - mean * mean
     covariance = _blur(x * target.image) - mean * target.mean

@@ -111,10 +111,14 @@ def render(gaussians: Gaussians, camera: Camera, **options) -> Rendering:
 
 
 def sh_to_rgb(sh: Tensor, directions: Tensor) -> Tensor:
-    """Colour (n, 3) of spherical harmonics (n, (degree + 1)², 3) of degree 0 to 3: 0.5 + Σ basis·sh, at least 0.
+    """Colour (n, 3) of harmonics (n, (degree + 1)², 3) of degree 0 to 3: 0.5 + Σ basis·sh, at least 0.
 
-    ``directions`` (n, 3) are unit vectors from the camera to the Gaussians. The harmonics are real, in the order
-    and with the signs of the 3DGS file format (Kerbl et al. 2023): m = -l … l, with the Condon-Shortley phase.
+    ``directions`` (n, 3) are unit vectors from the camera to the Gaussians. The harmonics are real, in the
+    order and with the signs of the 3DGS file format (Kerbl et al. 2023): m = -l … l, with the Condon-Shortley
+    phase.
+
+    Raises:
+        ValueError: another number of coefficients.
     """
     basis = _sh_basis(directions, sh.shape[1])
     return (0.5 + torch.einsum("nb,nbc->nc", basis, sh)).clamp(min=0)

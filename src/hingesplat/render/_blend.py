@@ -195,7 +195,7 @@ def blend(
 
 @njit(**INNER)
 def _load_plane(plane, x0, y0, x1, y1, width, image, i, gradient, j, buffer):
-    """The gradient of an image plane (at gradient[j]) to the buffer; times the plane (at image[i]) to the rest."""
+    """The gradient of a plane (at gradient[j]) to the buffer; times the plane (at image[i]) to the rest."""
     for r in range(y1 - y0 + 1):
         p, b, c = (y0 + r) * width + x0, r * PITCH, 0
         while c + LANES <= x1 - x0 + 1:

@@ -1,9 +1,8 @@
 """Projection of 3D Gaussians to the image and back: SIMD kernels, LANES Gaussians at a time.
 
 All arrays are flat. ``view`` holds what ``View`` names; a *record* is what the pixel loops need to know of
-one projected Gaussian: the fields of ``_tiles``, then its colours, its channels, its depth, and zeros up to
-the planes drawn. Blocks overlap at the end instead of being cut short, so at least LANES Gaussians are
-needed.
+one projected Gaussian: the fields named in ``_tiles``, then its colours, its channels, its depth, and zeros.
+Blocks overlap at the end instead of being cut short, so at least LANES Gaussians are needed.
 """
 
 import math

@@ -162,8 +162,7 @@ def _list_segments(g, box, row0, row1, columns, record, stride, slot0, cursor, b
 def fill_lists(
     build, visible, order, boxes, record, stride, offsets, starts, columns, items, slots, shapes, t, threads
 ):
-    """Write the lists of the tiles, front to back; thread t does the tile rows that hold its share of the
-    work."""
+    """Write the lists of the tiles, front to back; thread t takes tile rows with its share of the work."""
     rows = (starts.shape[0] - 1) // columns
     total = starts[rows * columns]
     row0 = 0

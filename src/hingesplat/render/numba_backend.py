@@ -1,5 +1,4 @@
-"""The CPU engine: projection, depth sort, tile lists and pixel loops as cached Numba kernels with explicit
-SIMD.
+"""The CPU engine: projection, depth sort, tile lists and pixel loops as cached SIMD kernels (Numba).
 
 The kernels live in ``_project``, ``_tiles`` and ``_blend``; this file allocates, runs them on threads, and
 gives them to autograd. Nothing is shared between calls, so any number of forward passes may wait for their
@@ -27,8 +26,7 @@ from hingesplat.render.torch_backend import (
 from hingesplat.simd import LANES, Build, parallel
 
 CHANNEL_SIZES = (0, 1, 4, 8, 16)
-"""Numbers of channels that kernels are compiled for; others are padded up, and more are drawn in several
-passes."""
+"""Numbers of channels that kernels are compiled for; others are padded up, more take several passes."""
 
 GAUSSIANS_PER_THREAD = 1024
 """With fewer, another thread costs more than it brings."""
@@ -77,18 +75,15 @@ def rasterize(
         )
         pieces.append(torch.cat([head, tail])[:count])
     if screen_gradient is not None and rgb.requires_grad:
-        _watch(shift, rgb.grad_fn.seen, rgb.grad_fn.radius, screen_gradient, n)
+        seen, radius = rgb.grad_fn.seen, rgb.grad_fn.radius
+        # ``shift`` moves the projected means of all passes, so its gradient is theirs.
+        shift.register_hook(lambda g: record_screen_gradient(screen_gradient, seen, g[seen], radius))
     return rgb, depth, alpha, pieces[0] if len(pieces) == 1 else torch.cat(pieces)
-
-
-def _watch(shift: Tensor, seen: Tensor, radius: Tensor, statistics: Tensor, n: int) -> None:
-    """Record the gradient of the projected means, summed over all passes, when backward reaches ``shift``."""
-    shift.register_hook(lambda g: record_screen_gradient(statistics, seen, g[seen], radius))
 
 
 @dataclass
 class _State:
-    """What the backward pass needs of a forward pass besides its tensors."""
+    """What the backward pass needs of a forward pass besides its tensors; names as in the kernels."""
 
     build: Build
     camera: Camera
@@ -127,8 +122,7 @@ def _draw(
     background: np.ndarray,
     early_stop: bool,
 ) -> tuple[_State, np.ndarray]:
-    """Draw to ``state.image`` (3 + C + 2, height, width): colours, channels, depth, alpha; and who was
-    visible."""
+    """Draw colours, channels, depth and alpha to ``state.image`` (3 + C + 2, H, W); and tell who is seen."""
     n, count = channels.shape
     planes = next(size for size in CHANNEL_SIZES if size >= count) + 4  # colours and depth
     build, view = _BUILD.with_planes(planes), _view(camera)
@@ -150,16 +144,14 @@ def _draw(
     items, slots, shapes = (np.empty(total, np.int32) for _ in range(3))
     lists = (record, stride, offsets, starts, columns, items, slots, shapes)
     parallel(fill_lists, threads, _BUILD, visible, order, boxes, *lists)
-    tiles_by_load = np.argsort(
-        starts[:-1] - starts[1:], kind="stable"
-    )  # the longest lists first, for balance
+    tiles = np.argsort(starts[:-1] - starts[1:], kind="stable")  # the longest lists first, for balance
 
     backdrop = np.zeros(3 + count + 1, np.float32)
     backdrop[:3] = background
     image = np.empty((3 + count + 2, height, width), np.float32)
     floor = np.float32(TRANSMITTANCE_MIN if early_stop else 0)
     stops, tickets = np.empty(columns * rows, np.int64), np.zeros(1, np.int64)
-    work = (tiles_by_load, width, height, record, stride, items, shapes, starts, stops, floor)
+    work = (tiles, width, height, record, stride, items, shapes, starts, stops, floor)
     parallel(blend, threads, build, tickets, *work, backdrop, image.reshape(-1))
     return _State(
         build,
@@ -173,7 +165,7 @@ def _draw(
         shapes,
         starts,
         stops,
-        tiles_by_load,
+        tiles,
         image,
         floor,
         threads,

@@ -1,16 +1,14 @@
-"""The definition of the rasteriser: brute force over all pixels and Gaussians, in plain torch, in any float
-type.
+"""The definition of the rasteriser: brute force over pixels and Gaussians, in plain torch, in any float type.
 
 Conventions are those of gsplat 1.5.3 (Apache-2.0), stated here in our own words:
 
-* EWA projection: Σ' = J W Σ Wᵀ Jᵀ + 0.3·I (pixels²), J taken at the centre clamped to 1.3 times the field of
+* EWA projection: Σ' = J W Σ Wᵀ Jᵀ + 0.3·I (pixels²), J taken at the centre moved into 1.3 times the field of
   view;
-* α = min(0.999, o·exp(-½ dᵀ Σ'⁻¹ d)), d from the pixel centre (+0.5) to the projected mean; α < 1/255 counts
-  as 0;
+* α = min(0.999, o·exp(-½ dᵀ Σ'⁻¹ d)), d from the projected mean to the pixel centre (+0.5);
+* α below 1/255 counts as 0;
 * front to back by the depth of the centres, ties by index; what lies nearer than 0.01 is not drawn;
-* with ``early_stop``, a pixel takes nothing more once its transmittance is at most 1e-4. (gsplat moreover
-  drops the Gaussian that would bring it there. We keep it: dropping it can cost a tenth of the light of a
-  pixel.)
+* with ``early_stop``, a pixel takes nothing more once its transmittance is at most 1e-4. gsplat also drops
+  the Gaussian that would bring it there; we keep it, since it can hold a tenth of the light of a pixel.
 """
 
 import torch

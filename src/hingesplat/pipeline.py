@@ -1,0 +1,589 @@
+"""Photographs in, twin out: the one file that knows the order of the stages.
+
+Every stage reads what those before it wrote into the run folder and writes its own, so a run that was stopped goes on
+where it was. ``stages.json`` says which stages are finished; files are written whole or not at all.
+"""
+
+import json
+import logging
+import platform
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from hashlib import blake2b
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import trimesh
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from hingesplat.articulate import ArticulateConfig, Articulation, articulate
+from hingesplat.capture import Capture, View
+from hingesplat.capture.images import downsampled
+from hingesplat.errors import HingesplatError
+from hingesplat.export.mjcf import write_mjcf
+from hingesplat.export.splats import write_ply
+from hingesplat.export.urdf import write_urdf
+from hingesplat.fit import FitConfig, fit
+from hingesplat.fuse import FuseConfig, fuse
+from hingesplat.gaussians import Gaussians, posed
+from hingesplat.joints import JointsConfig, find_joints
+from hingesplat.mesh import MeshConfig, mesh_parts
+from hingesplat.pictures import write_motion_gif, write_summary
+from hingesplat.render import render
+from hingesplat.segment import SegmentConfig, Segmentation, segment
+from hingesplat.twin import Joint, Part, Twin
+
+log = logging.getLogger(__name__)
+
+Report = Callable[..., None]
+PresetName = Literal["fast", "standard", "paper"]
+
+MAX_UNEXPLAINED = 0.8
+"""Share of what moved that no rigid part explains, above which there is no point in going on."""
+ARTEFACTS = (
+    "config.json stages.json summary.* metrics.json log.txt fit_state*.safetensors segmentation.* "
+    "canonical.safetensors articulation.safetensors gaussians*.safetensors twin.json parts export motion.gif *.tmp"
+).split()
+"""Everything that a run folder holds; ``overwrite`` deletes these and nothing else."""
+
+
+@dataclass(frozen=True)
+class ReconstructConfig:
+    """Everything that a reconstruction can be told."""
+
+    preset: PresetName = "standard"
+    """Where the numbers of the stages come from: about half the steps, ours, or the paper's."""
+    parts: Literal["auto"] | int = "auto"
+    """Number of rigid parts with the base, as ``twin.json`` lists them; ``auto`` finds it."""
+    seed: int = 0
+    """Of every random choice; the same seed on the same machine gives the same joints."""
+    max_size: int | None = None
+    """Photographs longer than this many pixels are downsampled."""
+    depth: bool = False
+    """Start the Gaussians from the capture's depth pictures where it has some."""
+    fit: FitConfig = field(default_factory=FitConfig)
+    segment: SegmentConfig = field(default_factory=SegmentConfig)
+    fuse: FuseConfig = field(default_factory=FuseConfig)
+    articulate: ArticulateConfig = field(default_factory=ArticulateConfig)
+    joints: JointsConfig = field(default_factory=JointsConfig)
+    mesh: MeshConfig = field(default_factory=MeshConfig)
+
+
+def preset(name: PresetName) -> ReconstructConfig:
+    """``standard``: the defaults. ``fast``: about half the steps. ``paper``: its iterations and sizes.
+
+    The paper fits for 30 000 iterations, fuses for 5 000 and articulates for 20 000 (Part²GS, supplementary,
+    implementation details), with the densification of 3DGS (Kerbl et al. 2023), which our cap does not bind.
+    """
+    config = ReconstructConfig(preset=name)
+    match name:
+        case "standard":
+            return config
+        case "fast":
+            return replace(
+                config,
+                fit=replace(config.fit, steps=config.fit.steps // 2),
+                articulate=replace(config.articulate, steps=config.articulate.steps // 2),
+                mesh=replace(config.mesh, views=config.mesh.views // 2, image_size=200),
+            )
+        case "paper":
+            return replace(
+                config,
+                fit=replace(
+                    config.fit, steps=30_000, start_gaussians=50_000, max_gaussians=500_000, max_sh_degree=3
+                ),
+                articulate=replace(config.articulate, steps=20_000),
+                mesh=replace(config.mesh, views=100, image_size=400, resolution=256),
+            )
+    raise HingesplatError(f"preset: unknown {name!r}; use fast, standard or paper")
+
+
+@dataclass(frozen=True)
+class Run:
+    """What every stage sees: the photographs, what to do with them, and the folder that stages talk through."""
+
+    folder: Path
+    capture: Capture
+    config: ReconstructConfig
+    report: Report
+
+    def __truediv__(self, name: str) -> Path:
+        return self.folder / name
+
+    def reporting(self, stage: str, **more: Any) -> Report:
+        return partial(self.report, stage=stage, **more)
+
+    @property
+    def views(self) -> list[Sequence[View]]:
+        """The training photographs of every state."""
+        return [state.train for state in self.capture.states]
+
+
+def reconstruct(
+    capture: Capture,
+    config: ReconstructConfig | None = None,
+    *,
+    out: Path | None = None,
+    overwrite: bool = False,
+    report: Report = lambda **_: None,
+) -> Twin:
+    """Photographs of an object in two or more states to a twin of it that moves.
+
+    Args:
+        capture: what ``load_capture`` gives.
+        config: the defaults if None; see ``preset``.
+        out: the run folder, made if absent; a run of the same capture and config goes on after its last
+            finished stage. A new temporary folder, named in the log, if None.
+        overwrite: start afresh where ``out`` holds another run.
+        report: called with ``stage`` when a stage begins, with ``stage, seconds`` when it ends, and between with
+            ``stage, step, steps, loss, psnr, gaussians`` (and ``state`` while fitting).
+
+    Returns:
+        The twin; the paths in it are relative to ``out``.
+
+    Raises:
+        HingesplatError: ``out`` belongs to another capture, config or program; the config makes no sense; or a
+            motion that no rigid parts explain.
+    """
+    config = config or ReconstructConfig()
+    _check(config)
+    capture = _capped(capture, config.max_size)
+    folder = Path(tempfile.mkdtemp(prefix="hingesplat-")) if out is None else Path(out)
+    _open(folder, capture, config, overwrite)
+    run = Run(folder, capture, config, report)
+    try:
+        with _log_file(folder / "log.txt"):
+            log.info("%s to %s", capture.path, folder)
+            _run_stages(run)
+    finally:
+        for leftover in folder.glob("**/*.tmp"):
+            shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink(missing_ok=True)
+    return Twin.load(run / "twin.json")
+
+
+def _run_stages(run: Run) -> None:
+    finished = _read_json(run / "stages.json") if (run / "stages.json").is_file() else {}
+    for name, stage in STAGES.items():
+        if name in finished:
+            log.info("%s: done before", name)
+            continue
+        run.report(stage=name)
+        started = time.perf_counter()
+        stage(run)
+        seconds = time.perf_counter() - started
+        finished[name] = {"seconds": round(seconds, 2), "peak_memory_mb": peak_memory_mb()}
+        write_json(run / "stages.json", finished)
+        run.report(stage=name, seconds=seconds)
+        log.info("%s: %.1f s", name, seconds)
+    _write_summary(run, finished)
+
+
+# The stages, each a function of the run that reads files and writes files.
+
+
+def _fit(run: Run) -> None:
+    for t, state in enumerate(run.capture.states):
+        path = run / f"fit_state{t}.safetensors"
+        if not path.is_file():
+            config, seed = run.config.fit, run.config.seed
+            points = depth_points(state.train, config.start_gaussians, seed) if run.config.depth else None
+            report = run.reporting("fit", state=t)
+            fit(state.train, config, seed=seed, points=points, report=report).save(path)
+
+
+def _segment(run: Run) -> None:
+    """Parts from the first and the last state: the farther the motion, the plainer."""
+    last = len(run.capture.states) - 1
+    pair = (_fitted(run, 0), _fitted(run, last))
+    parts = None if run.config.parts == "auto" else run.config.parts - 1
+    found = segment(
+        pair, (run.views[0], run.views[last]), run.config.segment, parts=parts, seed=run.config.seed
+    )
+    _check_explained(run, found, last)
+    write_tensors(
+        run / "segmentation.safetensors",
+        {
+            "labels_0": torch.from_numpy(np.asarray(found.labels[0], np.int64)),
+            "labels_1": torch.from_numpy(np.asarray(found.labels[1], np.int64)),
+            "T_1_0": torch.from_numpy(np.stack([np.eye(4), *(m.T for m in found.motions)])),
+        },
+    )
+    motions = [{k: np.asarray(v).tolist() for k, v in asdict(m).items()} for m in found.motions]
+    known = {"states": [0, last], "seeds": found.seeds, "unexplained": found.unexplained, "motions": motions}
+    write_json(run / "segmentation.json", known)
+
+
+def _fuse(run: Run) -> None:
+    found = load_file(run / "segmentation.safetensors")
+    last = len(run.capture.states) - 1
+    if len(found["T_1_0"]) == 1:  # Nothing moved: the first state is all there is.
+        canonical = _fitted(run, 0)
+    else:
+        labels = (found["labels_0"].numpy(), found["labels_1"].numpy())
+        pair = (_fitted(run, 0), _fitted(run, last))
+        canonical = fuse(pair, labels, found["T_1_0"].numpy(), run.config.fuse, seed=run.config.seed)
+    canonical.save(run / "canonical.safetensors")
+
+
+def initial_transforms(T_1_0: np.ndarray, states: int) -> np.ndarray:
+    """T_state_0 (states, parts, 4, 4) to start from, from the motions (parts, 4, 4) between first and last state.
+
+    States between the two start where state 0 is.
+    """
+    T_state_0 = np.tile(np.eye(4), (states, len(T_1_0), 1, 1))
+    T_state_0[-1] = T_1_0
+    return T_state_0
+
+
+def _articulate(run: Run) -> None:
+    canonical = Gaussians.load(run / "canonical.safetensors")
+    T_1_0 = load_file(run / "segmentation.safetensors")["T_1_0"].numpy()
+    T_state_0 = initial_transforms(T_1_0, len(run.capture.states))
+    if len(T_1_0) == 1:
+        moved = Articulation(canonical, T_state_0, torch.zeros(len(T_state_0), len(canonical), 3))
+    else:
+        config, report = run.config.articulate, run.reporting("articulate")
+        moved = articulate(canonical, T_state_0, run.views, config, seed=run.config.seed, report=report)
+    extra = {"T_state_0": torch.from_numpy(np.asarray(moved.T_state_0)), "state_sh": moved.state_sh}
+    write_tensors(run / "articulation.safetensors", vars(moved.gaussians) | extra)
+
+
+def _joints(run: Run) -> None:
+    """Joints, the final Gaussians, and these posed and coloured as they stand in each state."""
+    gaussians = Gaussians.load(run / "articulation.safetensors")
+    extra = load_file(run / "articulation.safetensors")
+    T_state_0, state_sh = extra["T_state_0"].numpy(), extra["state_sh"]
+    joints: tuple[Joint, ...] = ()
+    if T_state_0.shape[1] > 1:
+        config, report = run.config.joints, run.reporting("joints")
+        found = find_joints(
+            gaussians, T_state_0, state_sh, run.views, config, seed=run.config.seed, report=report
+        )
+        gaussians, state_sh, joints = found.gaussians, found.state_sh, found.joints
+    gaussians = gaussians.detached()
+    ids = [0, *sorted(j.child for j in joints)]
+    parts = [Part(i, f"part_{i}" if i else "base", int((gaussians.part == i).sum())) for i in ids]
+    twin = Twin(tuple(parts), joints, metres_per_unit=run.capture.metres_per_unit)
+    for t in range(len(run.capture.states)):
+        there = coloured(posed(gaussians, twin.at_state(t)), state_sh[t]) if joints else _fitted(run, t)
+        there.save(run / f"gaussians_state{t}.safetensors")
+    gaussians.save(run / "gaussians.safetensors")
+    twin.save(run / "twin.json")
+
+
+def _mesh(run: Run) -> None:
+    gaussians, twin = _result(run)
+    states = [([v.camera for v in views], twin.at_state(t)) for t, views in enumerate(run.views)]
+    meshes = mesh_parts(gaussians, states, run.config.mesh)
+    parts = []
+    with whole_folder(run / "parts") as folder:
+        for part in twin.parts:
+            write_ply(gaussians[gaussians.part == part.id], folder / f"{part.name}.ply")
+            part = replace(part, splats=f"parts/{part.name}.ply")
+            if part.id in meshes:
+                meshes[part.id].export(folder / f"{part.name}.glb")
+                meshes[part.id].export(folder / f"{part.name}.obj")
+                part = replace(part, mesh=f"parts/{part.name}.glb")
+            parts.append(part)
+    replace(twin, parts=tuple(parts)).save(run / "twin.json")
+
+
+def _export(run: Run) -> None:
+    twin = Twin.load(run / "twin.json")
+    meshes = load_meshes(run.folder, twin)
+    with whole_folder(run / "export") as folder:
+        write_urdf(twin, meshes, folder, scale=twin.metres_per_unit)
+        write_mjcf(twin, meshes, folder, scale=twin.metres_per_unit)
+
+
+def _pictures(run: Run) -> None:
+    gaussians, twin = _result(run)
+    poses = [twin.at_state(t) for t in range(len(run.capture.states))]
+    best = [telling_view(posed(gaussians, T), views) for T, views in zip(poses, run.views, strict=True)]
+    write_summary(run / "summary.png", gaussians, list(zip(best, poses, strict=True)))
+    write_motion_gif(run / "motion.gif", gaussians, twin, best[-1].camera)
+
+
+STAGES: dict[str, Callable[[Run], None]] = {
+    "fit": _fit,
+    "segment": _segment,
+    "fuse": _fuse,
+    "articulate": _articulate,
+    "joints": _joints,
+    "mesh": _mesh,
+    "export": _export,
+    "pictures": _pictures,
+}
+
+
+# What the stages lean on.
+
+
+def _fitted(run: Run, state: int) -> Gaussians:
+    return Gaussians.load(run / f"fit_state{state}.safetensors")
+
+
+def _result(run: Run) -> tuple[Gaussians, Twin]:
+    return Gaussians.load(run / "gaussians.safetensors"), Twin.load(run / "twin.json")
+
+
+def _check(config: ReconstructConfig) -> None:
+    if config.parts != "auto" and config.parts < 2:
+        raise HingesplatError(f"parts: must be auto, or at least 2 (the base and a mover), not {config.parts}")
+    if config.max_size is not None and config.max_size < 1:
+        raise HingesplatError(f"max_size: must be at least 1 pixel, not {config.max_size}")
+
+
+def _check_explained(run: Run, found: Segmentation, last: int) -> None:
+    """Nothing moved is a result; something moved but not rigidly is none."""
+    if not found.motions and found.seeds < 2 * run.config.segment.min_part_seeds:
+        log.warning("no motion found between state 0 and state %d: the twin will be static", last)
+    elif not found.motions or found.unexplained > MAX_UNEXPLAINED:
+        share = found.unexplained if found.motions else 1.0
+        raise HingesplatError(
+            f"{run.capture.path}: no rigid parts explain {share:.0%} of what moved between state 0 and state {last}; "
+            "check that the poses of both states share one frame, that the masks hold the object only, and that "
+            "its parts are rigid"
+        )
+
+
+def depth_points(views: Sequence[View], n: int, seed: int) -> np.ndarray | None:
+    """n points (n, 3) of the world frame drawn from the depth pictures' masked pixels; None without any."""
+    rng = np.random.default_rng(seed)
+    clouds = []
+    for view in views:
+        rows, columns = np.nonzero(
+            (view.depth > 0) & (view.rgba[..., 3] >= 128) if view.depth is not None else np.zeros((1, 1))
+        )
+        if view.depth is None or len(rows) == 0:
+            continue
+        chosen = rng.integers(len(rows), size=min(n, len(rows)))
+        v, u, c = rows[chosen], columns[chosen], view.camera
+        z = view.depth[v, u].astype(np.float64)
+        local = np.stack([(u + 0.5 - c.cx) / c.fx * z, (v + 0.5 - c.cy) / c.fy * z, z], 1)
+        clouds.append(local @ c.T_world_camera[:3, :3].T + c.centre)
+    return rng.choice(np.concatenate(clouds), n) if clouds else None
+
+
+def coloured(gaussians: Gaussians, offset: Tensor) -> Gaussians:
+    """A state's own colours: ``offset`` (n, 3) added to the constant spherical harmonic."""
+    sh = gaussians.sh.clone()
+    sh[:, 0] += offset
+    return replace(gaussians, sh=sh).detached()
+
+
+@torch.no_grad()
+def telling_view(gaussians: Gaussians, views: Sequence[View], size: int = 64) -> View:
+    """The photograph in which the movable parts cover most pixels; the first one if nothing moves."""
+
+    def covered(view: View) -> float:
+        shrink = size / max(view.camera.width, view.camera.height)
+        w, h = (max(1, round(side * shrink)) for side in (view.camera.width, view.camera.height))
+        movable = (gaussians.part > 0).to(gaussians.means)[:, None]
+        return float(render(gaussians, view.camera.scaled(w, h), channels=movable).channels.mean())
+
+    return max(views, key=covered)
+
+
+def load_meshes(folder: Path, twin: Twin) -> dict[int, trimesh.Trimesh]:
+    """The part meshes of a run, by part id, frame of state 0.
+
+    Raises:
+        HingesplatError: a mesh file is missing or broken.
+    """
+    meshes = {}
+    for part in twin.parts:
+        if part.mesh is not None:
+            path = folder / part.mesh
+            try:
+                mesh = trimesh.load(path, force="mesh", process=False)
+            except Exception as e:  # Readers of many formats raise errors of many kinds.
+                raise HingesplatError(f"{path}: missing or no readable mesh; reconstruct again") from e
+            assert isinstance(mesh, trimesh.Trimesh)
+            meshes[part.id] = mesh
+    return meshes
+
+
+def _capped(capture: Capture, max_size: int | None) -> Capture:
+    """The capture with its photographs at most ``max_size`` pixels long."""
+    if max_size is None:
+        return capture
+
+    def cap(views: Sequence[View]) -> tuple[View, ...]:
+        return tuple(downsampled(v, max_size) if max(v.rgba.shape[:2]) > max_size else v for v in views)
+
+    states = (replace(s, train=cap(s.train), test=cap(s.test)) for s in capture.states)
+    return replace(capture, states=tuple(states))
+
+
+# The run folder.
+
+
+def _open(folder: Path, capture: Capture, config: ReconstructConfig, overwrite: bool) -> None:
+    """Make the folder ready: new, or that of the same run, or cleared of another."""
+    path = folder / "config.json"
+    identity = {
+        **json.loads(json.dumps(asdict(config))),
+        "capture": str(capture.path.resolve()),
+        "photographs": fingerprint(capture),
+    }
+    if path.is_file():
+        known = _read_json(path)
+        if "photographs" not in known:
+            raise HingesplatError(f"{folder}: its config.json is not that of a run; give another folder")
+        if not overwrite:
+            _check_same_run(folder, known, identity)
+            return
+        for pattern in ARTEFACTS:
+            for old in folder.glob(pattern):
+                shutil.rmtree(old) if old.is_dir() else old.unlink()
+    elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise HingesplatError(f"{folder}: is in use and holds no run; give another folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(path, identity | {"versions": versions()})
+
+
+def _check_same_run(folder: Path, known: dict[str, Any], wanted: dict[str, Any]) -> None:
+    remedy = "give another folder, or --overwrite to start afresh"
+    if known["capture"] != wanted["capture"]:
+        raise HingesplatError(f"{folder}: belongs to another capture ({known['capture']}); {remedy}")
+    old, new = _flat(known), _flat(wanted)
+    changed = [k for k in new if k != "photographs" and old.get(k) != new[k]]
+    if changed:
+        k = changed[0]
+        more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
+        raise HingesplatError(
+            f"{folder}: was made with another config ({k} was {old.get(k)}, is {new[k]}{more}); {remedy}"
+        )
+    if known["photographs"] != wanted["photographs"]:
+        raise HingesplatError(
+            f"{folder}: belongs to another capture (the photographs in {known['capture']} have changed); {remedy}"
+        )
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested keys joined by dots."""
+    flat = {}
+    for key, value in tree.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return flat
+
+
+def fingerprint(capture: Capture) -> str:
+    """A digest of every training pixel, mask and camera: what the twin is made from."""
+    digest = blake2b(digest_size=12)
+    for state in capture.states:
+        for view in state.train:
+            c = view.camera
+            digest.update(np.array([*c.T_world_camera.ravel(), c.fx, c.fy, c.cx, c.cy]).tobytes())
+            digest.update(np.ascontiguousarray(view.rgba).data)
+            digest.update(b"" if view.depth is None else np.ascontiguousarray(view.depth).data)
+        digest.update(b"/")
+    return digest.hexdigest()
+
+
+def _write_summary(run: Run, finished: dict[str, Any]) -> None:
+    seconds = {name: entry["seconds"] for name, entry in finished.items()}
+    peaks = [entry["peak_memory_mb"] for entry in finished.values()]
+    device = Gaussians.load(run / "gaussians.safetensors").means.device.type
+    summary = {
+        "seconds": seconds | {"total": round(sum(seconds.values()), 2)},
+        "peak_memory_mb": max((p for p in peaks if p is not None), default=None),
+        "given": {"parts": run.config.parts != "auto", "types": False, "depth": run.config.depth},
+        "preset": run.config.preset,
+        "seed": run.config.seed,
+        "device": device,
+        "backend": "gsplat" if device == "cuda" else "numba",
+        "machine": f"{platform.machine()}, {torch.get_num_threads()} threads",
+        "versions": versions(),
+    }
+    write_json(run / "summary.json", summary)
+
+
+def versions() -> dict[str, str]:
+    """Of the program and of what its numbers depend on."""
+    found = {"python": platform.python_version()}
+    for name in ("hingesplat", "torch", "numba", "numpy", "scipy", "gsplat"):
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
+
+
+def peak_memory_mb() -> float | None:
+    """Most memory this process ever held, MB; None where the system does not tell."""
+    try:
+        import resource
+    except ImportError:  # Windows.
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)
+
+
+def write_json(path: Path, data: dict[str, Any]) -> None:
+    """Write a JSON file, whole or not at all."""
+    tmp = path.with_name(path.name + ".tmp")
+    tmp.write_text(json.dumps(data, indent=1))
+    tmp.replace(path)
+
+
+def write_tensors(path: Path, tensors: dict[str, Tensor]) -> None:
+    """Write a safetensors file, whole or not at all."""
+    tmp = path.with_name(path.name + ".tmp")
+    save_file({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, str(tmp))
+    tmp.replace(path)
+
+
+@contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """A folder to write into that takes the place of ``path`` when all went well."""
+    tmp = path.with_name(path.name + ".tmp")
+    shutil.rmtree(tmp, ignore_errors=True)
+    tmp.mkdir(parents=True)
+    yield tmp
+    shutil.rmtree(path, ignore_errors=True)
+    tmp.replace(path)
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(path.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as e:
+        raise HingesplatError(f"{path}: not valid JSON; give another folder") from e
+    if not isinstance(data, dict):
+        raise HingesplatError(f"{path}: must hold a JSON object; give another folder")
+    return data
+
+
+class _LogFile(logging.FileHandler):
+    """Silent where it cannot write: a full disk is reported by the stage that meets it."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        pass
+
+
+@contextmanager
+def _log_file(path: Path) -> Iterator[None]:
+    """What the package logs goes to this file, too."""
+    handler = _LogFile(path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s", "%Y-%m-%d %H:%M:%S"))
+    package = logging.getLogger("hingesplat")
+    level = package.level
+    package.addHandler(handler)
+    package.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        package.setLevel(level)
+        package.removeHandler(handler)
+        with suppress(OSError):
+            handler.close()
