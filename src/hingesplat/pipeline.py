@@ -1,7 +1,7 @@
 """Photographs in, twin out: the one file that knows the order of the stages.
 
-Every stage reads what those before it wrote into the run folder and writes its own, so a run that was stopped goes on
-where it was. ``stages.json`` says which stages are finished; files are written whole or not at all.
+Every stage reads what those before it wrote into the run folder and writes its own, so a run that was stopped
+goes on where it was. ``stages.json`` says which stages are finished; files are written whole or not at all.
 """
 
 import json
@@ -40,7 +40,7 @@ from hingesplat.joints import JointsConfig, find_joints
 from hingesplat.mesh import MeshConfig, mesh_parts
 from hingesplat.pictures import write_motion_gif, write_summary
 from hingesplat.render import render
-from hingesplat.segment import SegmentConfig, Segmentation, segment
+from hingesplat.segment import Segmentation, SegmentConfig, segment
 from hingesplat.twin import Joint, Part, Twin
 
 log = logging.getLogger(__name__)
@@ -51,9 +51,10 @@ PresetName = Literal["fast", "standard", "paper"]
 MAX_UNEXPLAINED = 0.8
 """Share of what moved that no rigid part explains, above which there is no point in going on."""
 ARTEFACTS = (
-    "config.json stages.json summary.* metrics.json log.txt fit_state*.safetensors segmentation.* "
-    "canonical.safetensors articulation.safetensors gaussians*.safetensors twin.json parts export motion.gif *.tmp"
-).split()
+    *("config.json", "stages.json", "log.txt", "fit_state*.safetensors", "segmentation.*"),
+    *("canonical.safetensors", "articulation.safetensors", "gaussians*.safetensors", "twin.json"),
+    *("parts", "export", "motion.gif", "summary.*", "metrics.json", "*.tmp"),
+)
 """Everything that a run folder holds; ``overwrite`` deletes these and nothing else."""
 
 
@@ -110,7 +111,7 @@ def preset(name: PresetName) -> ReconstructConfig:
 
 @dataclass(frozen=True)
 class Run:
-    """What every stage sees: the photographs, what to do with them, and the folder that stages talk through."""
+    """What every stage sees: photographs, what to do with them, and the folder that stages talk through."""
 
     folder: Path
     capture: Capture
@@ -145,15 +146,15 @@ def reconstruct(
         out: the run folder, made if absent; a run of the same capture and config goes on after its last
             finished stage. A new temporary folder, named in the log, if None.
         overwrite: start afresh where ``out`` holds another run.
-        report: called with ``stage`` when a stage begins, with ``stage, seconds`` when it ends, and between with
-            ``stage, step, steps, loss, psnr, gaussians`` (and ``state`` while fitting).
+        report: called with ``stage`` when a stage begins, with ``stage, seconds`` when it ends, and between
+            with ``stage, step, steps, loss, psnr, gaussians`` (and ``state`` while fitting).
 
     Returns:
         The twin; the paths in it are relative to ``out``.
 
     Raises:
-        HingesplatError: ``out`` belongs to another capture, config or program; the config makes no sense; or a
-            motion that no rigid parts explain.
+        HingesplatError: ``out`` belongs to another capture, config or program; the config makes no sense; or
+            no rigid parts explain the motion.
     """
     config = config or ReconstructConfig()
     _check(config)
@@ -236,9 +237,10 @@ def _fuse(run: Run) -> None:
 
 
 def initial_transforms(T_1_0: np.ndarray, states: int) -> np.ndarray:
-    """T_state_0 (states, parts, 4, 4) to start from, from the motions (parts, 4, 4) between first and last state.
+    """T_state_0 (states, parts, 4, 4) to start from.
 
-    States between the two start where state 0 is.
+    ``T_1_0`` (parts, 4, 4) are the motions from the first state to the last, the identity for the base. States
+    between the two start where state 0 is.
     """
     T_state_0 = np.tile(np.eye(4), (states, len(T_1_0), 1, 1))
     T_state_0[-1] = T_1_0
@@ -339,7 +341,9 @@ def _result(run: Run) -> tuple[Gaussians, Twin]:
 
 def _check(config: ReconstructConfig) -> None:
     if config.parts != "auto" and config.parts < 2:
-        raise HingesplatError(f"parts: must be auto, or at least 2 (the base and a mover), not {config.parts}")
+        raise HingesplatError(
+            f"parts: must be auto, or at least 2 (the base and a mover), not {config.parts}"
+        )
     if config.max_size is not None and config.max_size < 1:
         raise HingesplatError(f"max_size: must be at least 1 pixel, not {config.max_size}")
 
@@ -351,9 +355,9 @@ def _check_explained(run: Run, found: Segmentation, last: int) -> None:
     elif not found.motions or found.unexplained > MAX_UNEXPLAINED:
         share = found.unexplained if found.motions else 1.0
         raise HingesplatError(
-            f"{run.capture.path}: no rigid parts explain {share:.0%} of what moved between state 0 and state {last}; "
-            "check that the poses of both states share one frame, that the masks hold the object only, and that "
-            "its parts are rigid"
+            f"{run.capture.path}: no rigid parts explain {share:.0%} of what moved between state 0 and "
+            f"state {last}; check that the poses of both states share one frame, that the masks hold the object "
+            "only, and that its parts are rigid"
         )
 
 
@@ -467,7 +471,8 @@ def _check_same_run(folder: Path, known: dict[str, Any], wanted: dict[str, Any])
         )
     if known["photographs"] != wanted["photographs"]:
         raise HingesplatError(
-            f"{folder}: belongs to another capture (the photographs in {known['capture']} have changed); {remedy}"
+            f"{folder}: belongs to another capture (the photographs in {known['capture']} have changed); "
+            f"{remedy}"
         )
 
 

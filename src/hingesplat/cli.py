@@ -1,0 +1,475 @@
+"""The commands. What takes seconds to import is imported where a command runs: ``--help`` is quick."""
+
+import logging
+import os
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, make_dataclass, replace
+from dataclasses import field as dataclass_field
+from math import degrees
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TextColumn
+from rich.table import Table
+from rich.text import Text
+
+import hingesplat
+from hingesplat.errors import HingesplatError
+
+if TYPE_CHECKING:
+    from hingesplat.twin import Twin
+
+INTERRUPTED, BAD_INPUT, BUG = 130, 2, 1
+"""Exit codes beside 0."""
+FLAGS = (tyro.conf.FlagCreatePairsOff,)
+"""Of tyro: ``--quiet`` without a ``--no-quiet`` beside it."""
+
+
+@dataclass(frozen=True)
+class Reconstruct:
+    """Photographs of an object in two or more states to a moving twin; every stage has its options."""
+
+    capture: tyro.conf.Positional[Path]
+    """Folder of the capture; its layout is recognised."""
+    out: Path
+    """Run folder. A run that was stopped goes on after its last finished stage."""
+    masks: Path | None = None
+    """Folder of masks (MASKS/STATE/IMAGE.png), where the images have none."""
+    overwrite: bool = False
+    """Start afresh where the run folder holds another run."""
+    quiet: bool = False
+    """Say nothing but warnings and errors."""
+    config: tyro.conf.Suppress[Any] = None  # A ReconstructConfig; ``parse_reconstruct`` makes options of it.
+
+    @property
+    def log_folder(self) -> Path:
+        return self.out
+
+    def run(self, console: Console) -> None:
+        from hingesplat.capture import load_capture
+
+        config = self.config
+        capture = load_capture(
+            self.capture, max_size=config.max_size, masks=self.masks, with_depth=config.depth
+        )
+        twin = _reconstruct(capture, config, self.out, self.overwrite, console)
+        show_joints(console, twin)
+        show_paths(console, self.out)
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Make a cabinet of a door and a drawer, photograph it, rebuild it as a twin, and measure the twin."""
+
+    out: Path = Path("demo")
+    """Gets capture/, made once, and run/, made anew each time."""
+    quiet: bool = False
+    """Say nothing but warnings and errors."""
+
+    @property
+    def log_folder(self) -> Path:
+        return self.out / "run"
+
+    def run(self, console: Console) -> None:
+        from hingesplat.capture import load_capture
+        from hingesplat.metrics import evaluate
+        from hingesplat.pipeline import ReconstructConfig
+
+        started = time.perf_counter()
+        capture, run = self.out / "capture", self.out / "run"
+        if not (capture / "truth" / "meta.json").is_file():
+            Synth("cabinet", capture, size=200, views=50).run(console)
+        config = ReconstructConfig()
+        config = replace(
+            config, fit=replace(config.fit, steps=1200, start_gaussians=3000, max_gaussians=8000)
+        )
+        twin = _reconstruct(load_capture(capture), config, run, True, console)
+        show_joints(console, twin)
+        show_metrics(console, evaluate(run, capture / "truth"))
+        show_paths(console, run)
+        console.print(f"{time.perf_counter() - started:.0f} s in all")
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Compare a run with the truth; every number goes to RUN/metrics.json."""
+
+    run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """A run folder."""
+    truth: Path
+    """Folder of the truth, or the capture that holds it."""
+    quiet: bool = False
+    """Say nothing but warnings and errors."""
+
+    def run(self, console: Console) -> None:
+        from hingesplat.metrics import evaluate
+
+        show_metrics(console, evaluate(self.run_folder, self.truth))
+        console.print(f"written: {escape(str(self.run_folder / 'metrics.json'))}", soft_wrap=True)
+
+
+@dataclass(frozen=True)
+class Synth:
+    """Make an articulated object and its photographs: a capture with its truth beside it."""
+
+    name: tyro.conf.Positional[str]
+    """cabinet (a door and a drawer) or laptop."""
+    out: Path
+    """Folder for the capture."""
+    seed: int = 0
+    """Draws shape, textures, joint values and cameras."""
+    size: int = 400
+    """Width and height of the pictures, pixels."""
+    views: int = 60
+    """Training views a state; ten more are test views."""
+    quiet: bool = False
+    """Say nothing but warnings and errors."""
+
+    def run(self, console: Console) -> None:
+        from hingesplat.synth import make
+
+        with StageProgress(console) as report:
+            report(stage="synth")
+            make(
+                self.name,
+                self.out,
+                seed=self.seed,
+                size=self.size,
+                train_views=self.views,
+                progress=lambda done, total: report(stage="synth", step=done, steps=total),
+            )
+        console.print(f"written: {escape(str(self.out))}", soft_wrap=True)
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a run's twin for simulators and viewers."""
+
+    run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """A run folder."""
+    format: tuple[Literal["urdf", "mjcf", "ply"], ...] = ("urdf", "mjcf")
+    """ply: the whole twin in state 0 as one file of splats."""
+    out: Path | None = None
+    """Folder to write to; RUN/export if none is given."""
+    quiet: bool = False
+    """Say nothing but warnings and errors."""
+
+    def run(self, console: Console) -> None:
+        from hingesplat.export.mjcf import write_mjcf
+        from hingesplat.export.splats import write_ply
+        from hingesplat.export.urdf import write_urdf
+        from hingesplat.gaussians import Gaussians
+        from hingesplat.pipeline import load_meshes
+        from hingesplat.twin import Twin
+
+        twin = Twin.load(self.run_folder / "twin.json")
+        meshes = load_meshes(self.run_folder, twin)
+        out = self.out or self.run_folder / "export"
+        out.mkdir(parents=True, exist_ok=True)
+        for name in dict.fromkeys(self.format):
+            match name:
+                case "urdf":
+                    path = write_urdf(twin, meshes, out, scale=twin.metres_per_unit)
+                case "mjcf":
+                    path = write_mjcf(twin, meshes, out, scale=twin.metres_per_unit)
+                case "ply":
+                    path = out / "twin.ply"
+                    write_ply(Gaussians.load(self.run_folder / "gaussians.safetensors"), path)
+            console.print(f"written: {escape(str(path))}", soft_wrap=True)
+
+
+Command = Reconstruct | Demo | Evaluate | Synth | Export
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code: 0, 2 for bad input, 130 for Ctrl-C, 1 for a bug of ours."""
+    command = None
+    try:
+        command = parse(list(sys.argv[1:] if argv is None else argv))
+        with _logging_to_console(command.quiet):
+            _use_all_cores()
+            command.run(Console(stderr=True, quiet=command.quiet, highlight=False))
+        return 0
+    except SystemExit as e:  # Help, or options that make no sense; tyro has said so.
+        return e.code if isinstance(e.code, int) else BAD_INPUT
+    except HingesplatError as e:
+        return _fail(str(e), BAD_INPUT)
+    except KeyboardInterrupt:
+        return _fail(
+            "interrupted; finished stages are kept, the same command goes on from there", INTERRUPTED
+        )
+    except Exception as e:
+        if (message := _system_message(e)) is not None:
+            return _fail(message, BAD_INPUT)
+        where = _write_traceback(command)
+        return _fail(f"a fault in the program ({type(e).__name__}: {e}); its traceback is in {where}", BUG)
+
+
+def parse(args: list[str]) -> Command:
+    """The command line to a command. Raises SystemExit, as tyro does."""
+    if args[:1] == ["reconstruct"] and len(args) > 1:
+        return parse_reconstruct(args[1:])
+    commands: Any = tyro.conf.OmitSubcommandPrefixes[Command]
+    return tyro.cli(commands, args=args, prog="hingesplat", description=hingesplat.__doc__, config=FLAGS)
+
+
+def parse_reconstruct(args: list[str]) -> Reconstruct:
+    """The options of ``reconstruct`` with those of every stage; their defaults are the preset's."""
+    from hingesplat.pipeline import ReconstructConfig, preset
+
+    def parsed(default: ReconstructConfig) -> Any:
+        nested: Any = Annotated[ReconstructConfig, tyro.conf.arg(name="")]
+        fields = [("config", nested, dataclass_field(default=default, kw_only=True))]
+        full = make_dataclass("Reconstruct", fields, bases=(Reconstruct,), frozen=True)
+        return tyro.cli(
+            full, args=args, prog="hingesplat reconstruct", description=Reconstruct.__doc__, config=FLAGS
+        )
+
+    command = parsed(ReconstructConfig())
+    named = command.config.preset
+    return command if named == "standard" else parsed(preset(named))
+
+
+def _reconstruct(capture: Any, config: Any, out: Path, overwrite: bool, console: Console) -> "Twin":
+    from hingesplat.pipeline import reconstruct
+
+    with StageProgress(console) as report:
+        return reconstruct(capture, config, out=out, overwrite=overwrite, report=report)
+
+
+class _Remaining(ProgressColumn):
+    """Time left while the steps are known, time taken before and after."""
+
+    def render(self, task: Task) -> Text:
+        if task.finished or task.total is None or task.time_remaining is None:
+            return Text(f"{task.elapsed or 0:.0f} s")
+        return Text(f"{task.time_remaining:.0f} s left")
+
+
+class StageProgress:
+    """What the pipeline reports, as one line a stage: bar, step, loss, PSNR, Gaussians, time left."""
+
+    def __init__(self, console: Console) -> None:
+        columns = (
+            SpinnerColumn(finished_text="[green]✓[/]"),
+            TextColumn("{task.description}"),
+            BarColumn(24),
+            TextColumn("{task.fields[numbers]}"),
+            _Remaining(),
+        )
+        self.progress = Progress(*columns, console=console, disable=console.quiet or not console.is_terminal)
+        self.tasks: dict[str, Any] = {}
+
+    def __enter__(self) -> Callable[..., None]:
+        self.progress.start()
+        return self.report
+
+    def __exit__(self, *_: object) -> None:
+        self.progress.stop()
+
+    def report(
+        self, *, stage: str, state: int | None = None, seconds: float | None = None, **numbers: Any
+    ) -> None:
+        label = stage if state is None else f"{stage} state {state}"
+        if seconds is not None:
+            for name, task in self.tasks.items():
+                if name == stage or name.startswith(f"{stage} state "):
+                    self._finish(task)
+            return
+        if label not in self.tasks:
+            if (
+                state is not None and stage in self.tasks
+            ):  # A stage's first state takes the line of the stage.
+                self.tasks[label] = self.tasks.pop(stage)
+                self.progress.update(self.tasks[label], description=label)
+            else:
+                for task in self.tasks.values():
+                    self._finish(task)
+                self.tasks[label] = self.progress.add_task(label, total=None, numbers="")
+        if "steps" in numbers:
+            self.progress.update(
+                self.tasks[label],
+                total=numbers["steps"],
+                completed=numbers["step"],
+                numbers=_numbers(numbers),
+            )
+
+    def _finish(self, task: Any) -> None:
+        total = self.progress.tasks[self.progress.task_ids.index(task)].total or 1
+        self.progress.update(task, total=total, completed=total)
+
+
+def _numbers(numbers: dict[str, Any]) -> str:
+    texts = [f"{numbers['step']}/{numbers['steps']}"]
+    if numbers.get("loss") is not None:
+        texts.append(f"loss {numbers['loss']:.4f}")
+    if numbers.get("psnr") is not None:
+        texts.append(f"{numbers['psnr']:.1f} dB")
+    if numbers.get("gaussians") is not None:
+        texts.append(f"{numbers['gaussians']} Gaussians")
+    return "  ".join(texts)
+
+
+def show_joints(console: Console, twin: "Twin") -> None:
+    """The table of the joints found."""
+    if not twin.joints:
+        console.print("No joints: the twin is static.")
+        return
+    table = Table(
+        "part", "parent", "type", "axis", "pivot", "range", "confidence", "verdict", title="Joints found"
+    )
+    names = {part.id: part.name for part in twin.parts}
+    for j in twin.joints:
+        turns = j.type == "revolute"
+        low, high = (degrees(v) if turns else v for v in j.limits)
+        spread = j.std.motion if j.std.motion is None or not turns else degrees(j.std.motion)
+        motion = f"{low:.1f}° … {high:.1f}°" if turns else f"{low:.3f} … {high:.3f}"
+        if spread is not None:
+            motion += f" ± {spread:.2f}°" if turns else f" ± {spread:.4f}"
+        tilt = "" if j.std.axis_deg is None else f" ± {j.std.axis_deg:.2f}°"
+        table.add_row(
+            names.get(j.child, str(j.child)),
+            names.get(j.parent, str(j.parent)),
+            j.type,
+            _vector(j.axis) + tilt,
+            _vector(j.pivot) if turns else "",
+            motion,
+            "" if j.confidence is None else f"{j.confidence:.2f}",
+            escape(j.verdict),
+        )
+    console.print(table)
+
+
+def show_metrics(console: Console, metrics: dict[str, Any]) -> None:
+    """The tables of an evaluation: joints, then surfaces and pictures."""
+    table = Table(
+        "truth", "part", "type", "axis °", "position ×10", "pivot", "motion", "CD", title="Beside the truth"
+    )
+    for joint, cd in zip(metrics["joints"], metrics["cd"]["movable"], strict=True):
+        motion = [_number(joint["motion_deg"], 3, "°"), _number(joint["motion_units"], 4, " units")]
+        found = "missed" if joint["part"] is None else str(joint["part"])
+        kind = joint["type_true"]
+        table.add_row(
+            escape(joint["truth"]),
+            found,
+            kind if joint["type_found"] == kind else f"{joint['type_found']}, is {kind}",
+            _number(joint["axis_deg"], 3),
+            _number(joint["position_x10"], 3),
+            _number(joint["pivot"], 4),
+            "".join(motion),
+            _number(cd, 2),
+        )
+    console.print(table)
+    views, depth = metrics["views"], metrics["penetration"]["depth"]
+    numbers = {
+        "parts": f"{metrics['parts_found']} of {metrics['parts_true']}",
+        "superfluous": str(metrics["superfluous_parts"]),
+        "CD static": _number(metrics["cd"]["static"], 2),
+        "CD whole": _number(metrics["cd"]["whole"], 2),
+        "penetration": _number(depth, 4),
+        "PSNR": _number(views["psnr"], 2, " dB"),
+        "SSIM": _number(views["ssim"], 4),
+        "part IoU": _number(metrics["part_iou"], 3),
+    }
+    rest = Table(*numbers)
+    rest.add_row(*numbers.values())
+    console.print(rest)
+    if views.get("why_null"):
+        console.print(f"no pictures compared: {escape(views['why_null'])}", soft_wrap=True)
+
+
+def show_paths(console: Console, run: Path) -> None:
+    """What a run wrote and what it is for."""
+    table = Table.grid(padding=(0, 2))
+    for name, what in {
+        "twin.json": "parts and joints",
+        "parts": "splats and meshes",
+        "export/twin.urdf": "for robotics",
+        "export/twin.xml": "for MuJoCo",
+        "motion.gif": "the joints moving",
+        "summary.png": "photographs, renders, parts",
+        "metrics.json": "beside the truth",
+    }.items():
+        if (run / name).exists():
+            table.add_row(what, escape(str(run / name)))
+    console.print(table)
+
+
+def _number(value: float | None, digits: int, unit: str = "") -> str:
+    return "" if value is None else f"{value:.{digits}f}{unit}"
+
+
+def _vector(v: Sequence[float]) -> str:
+    return "(" + ", ".join(f"{x + 0.0:.3f}" for x in v) + ")"
+
+
+class _ConsoleHandler(logging.Handler):
+    """Log lines above the progress bars."""
+
+    def __init__(self, level: int) -> None:
+        super().__init__(level)
+        self.console = Console(stderr=True, highlight=False)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        style = "yellow" if record.levelno > logging.INFO else "dim"
+        self.console.print(escape(record.getMessage()), style=style, soft_wrap=True)
+
+
+@contextmanager
+def _logging_to_console(quiet: bool) -> Iterator[None]:
+    package = logging.getLogger("hingesplat")
+    handler, level = _ConsoleHandler(logging.WARNING if quiet else logging.INFO), package.level
+    package.addHandler(handler)
+    package.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        package.removeHandler(handler)
+        package.setLevel(level)
+
+
+def _fail(message: str, code: int) -> int:
+    sys.stderr.write(f"hingesplat: {' '.join(message.split())}\n")
+    return code
+
+
+def _system_message(error: Exception) -> str | None:
+    """One line for what the system refuses (no space, no permission), None for anything else."""
+    if "No space left on device" in str(error):  # From safetensors it comes as an error of its own.
+        where = getattr(error, "filename", None) or "writing"
+        return f"{where}: the disk is full; make room and run the same command again"
+    if isinstance(error, OSError):
+        return f"{error.filename or 'a file'}: {error.strerror or error}"
+    return None
+
+
+def _write_traceback(command: Command | None) -> Path:
+    folder = getattr(command, "log_folder", None)
+    path = (
+        folder / "log.txt"
+        if folder is not None and folder.is_dir()
+        else Path(tempfile.gettempdir()) / "hingesplat-log.txt"
+    )
+    with suppress(OSError), path.open("a", encoding="utf-8") as file:
+        traceback.print_exc(file=file)
+    return path
+
+
+def _use_all_cores() -> None:
+    """Torch takes half of the hardware threads by itself; an explicit OMP_NUM_THREADS wins."""
+    if "OMP_NUM_THREADS" not in os.environ:
+        import torch
+
+        torch.set_num_threads(os.cpu_count() or 1)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
