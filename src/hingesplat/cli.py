@@ -194,18 +194,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = None
     try:
         command = parse(list(sys.argv[1:] if argv is None else argv))
-        with _logging_to_console(command.quiet):
+        console = Console(quiet=command.quiet, highlight=False)
+        with _logging_to(console):
             _use_all_cores()
-            command.run(Console(stderr=True, quiet=command.quiet, highlight=False))
+            command.run(console)
         return 0
     except SystemExit as e:  # Help, or options that make no sense; tyro has said so.
         return e.code if isinstance(e.code, int) else BAD_INPUT
     except HingesplatError as e:
         return _fail(str(e), BAD_INPUT)
     except KeyboardInterrupt:
-        return _fail(
-            "interrupted; finished stages are kept, the same command goes on from there", INTERRUPTED
-        )
+        return _fail("interrupted; what is finished is kept, the same command goes on there", INTERRUPTED)
     except Exception as e:
         if (message := _system_message(e)) is not None:
             return _fail(message, BAD_INPUT)
@@ -229,9 +228,8 @@ def parse_reconstruct(args: list[str]) -> Reconstruct:
         nested: Any = Annotated[ReconstructConfig, tyro.conf.arg(name="")]
         fields = [("config", nested, dataclass_field(default=default, kw_only=True))]
         full = make_dataclass("Reconstruct", fields, bases=(Reconstruct,), frozen=True)
-        return tyro.cli(
-            full, args=args, prog="hingesplat reconstruct", description=Reconstruct.__doc__, config=FLAGS
-        )
+        prog = "hingesplat reconstruct"
+        return tyro.cli(full, args=args, prog=prog, description=Reconstruct.__doc__, config=FLAGS)
 
     command = parsed(ReconstructConfig())
     named = command.config.preset
@@ -412,21 +410,23 @@ def _vector(v: Sequence[float]) -> str:
 
 
 class _ConsoleHandler(logging.Handler):
-    """Log lines above the progress bars."""
+    """Log lines above the progress bars; warnings go to stderr, even when quiet."""
 
-    def __init__(self, level: int) -> None:
-        super().__init__(level)
-        self.console = Console(stderr=True, highlight=False)
+    def __init__(self, console: Console) -> None:
+        super().__init__(logging.INFO)
+        self.console = console
 
     def emit(self, record: logging.LogRecord) -> None:
-        style = "yellow" if record.levelno > logging.INFO else "dim"
-        self.console.print(escape(record.getMessage()), style=style, soft_wrap=True)
+        if record.levelno > logging.INFO:
+            _say(record.getMessage())
+        else:
+            self.console.print(escape(record.getMessage()), style="dim", soft_wrap=True)
 
 
 @contextmanager
-def _logging_to_console(quiet: bool) -> Iterator[None]:
+def _logging_to(console: Console) -> Iterator[None]:
     package = logging.getLogger("hingesplat")
-    handler, level = _ConsoleHandler(logging.WARNING if quiet else logging.INFO), package.level
+    handler, level = _ConsoleHandler(console), package.level
     package.addHandler(handler)
     package.setLevel(logging.INFO)
     try:
@@ -436,8 +436,13 @@ def _logging_to_console(quiet: bool) -> Iterator[None]:
         package.setLevel(level)
 
 
-def _fail(message: str, code: int) -> int:
+def _say(message: str) -> None:
+    """One line on stderr."""
     sys.stderr.write(f"hingesplat: {' '.join(message.split())}\n")
+
+
+def _fail(message: str, code: int) -> int:
+    _say(message)
     return code
 
 

@@ -1,7 +1,7 @@
 """Single-state Gaussians: the photographs of one state to G^t (method, section 1)."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -9,14 +9,22 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from hingesplat.camera import Camera
 from hingesplat.capture import View, visual_hull
-from hingesplat.gaussians import SH_C0, Gaussians
-from hingesplat.losses.photometric import Target, photometric, psnr
-from hingesplat.optim import GaussianAdam, LearningRates, densify, morton_order
-from hingesplat.render import Rendering, render
-
-Report = Callable[..., None]
+from hingesplat.gaussians import Gaussians
+from hingesplat.losses.photometric import photometric, psnr
+from hingesplat.optim import GaussianAdam, LearningRates, morton_order
+from hingesplat.render import render
+from hingesplat.training import (
+    Report,
+    TrainingView,
+    depth_and_its_square,
+    depth_variance,
+    four_planes,
+    grow,
+    mean_psnr,
+    seen_weight,
+    training_view,
+)
 
 
 @dataclass(frozen=True)
@@ -48,50 +56,6 @@ class FitConfig:
     rates: LearningRates = field(default_factory=LearningRates)
 
 
-@dataclass(frozen=True)
-class TrainingView:
-    """A photograph ready for the loop: cropped to the object, over white, with its alpha as a fourth plane."""
-
-    camera: Camera
-    target: Target
-    image: Tensor
-    """(4, h, w): rgb over white, alpha."""
-
-
-def training_view(view: View, margin: int = 8) -> TrainingView:
-    """Crop to the mask's rectangle plus a margin: what lies outside is background in every render, too."""
-    alpha = view.rgba[..., 3]
-    height, width = alpha.shape
-    rows, columns = np.flatnonzero(alpha.max(1)), np.flatnonzero(alpha.max(0))
-    if len(rows) == 0:
-        rows, columns = np.array([0, height - 1]), np.array([0, width - 1])
-    x0, x1 = max(columns[0] - margin, 0), min(columns[-1] + margin + 1, width)
-    y0, y1 = max(rows[0] - margin, 0), min(rows[-1] + margin + 1, height)
-    rgba = torch.from_numpy(view.rgba[y0:y1, x0:x1].astype(np.float32) / 255).permute(2, 0, 1)
-    image = torch.cat([rgba[:3] * rgba[3:] + 1 - rgba[3:], rgba[3:]]).contiguous()
-    camera = view.camera.cropped(int(x0), int(y0), int(x1 - x0), int(y1 - y0))
-    return TrainingView(camera, Target.of(image), image)
-
-
-def four_planes(rendering: Rendering) -> Tensor:
-    """Rgb and alpha of a rendering as (4, h, w), to compare with ``TrainingView.image``."""
-    return torch.cat([rendering.rgb, rendering.alpha[None]])
-
-
-def depth_and_its_square(means: Tensor, camera: Camera) -> Tensor:
-    """(n, 1) squared depth of each centre: the extra channel from which ``depth_variance`` is made."""
-    row = torch.as_tensor(camera.T_camera_world[2], dtype=means.dtype)
-    return (means @ row[:3] + row[3]).square()[:, None]
-
-
-def depth_variance(rendering: Rendering) -> Tensor:
-    """Mean over covered pixels of the variance of depth along the ray, scene units squared."""
-    alpha = rendering.alpha.clamp_min(1e-3)
-    mean = rendering.depth / alpha
-    variance = (rendering.channels[0] / alpha - mean.square()).clamp_min(0)
-    return (variance * (rendering.alpha > 0.5)).mean()
-
-
 def start_from_points(points: np.ndarray, spacing: float, generator: torch.Generator) -> Gaussians:
     """Grey, half-opaque balls on points (n, 3), each as wide as the distance to its neighbours."""
     n = len(points)
@@ -116,21 +80,6 @@ def hull_shell(views: Sequence[View], n: int, rng: np.random.Generator) -> tuple
     weight = np.where(neighbours < 0.85 * neighbours.max(), 1.0, 0.15)
     chosen = rng.choice(len(points), n, replace=len(points) < n, p=weight / weight.sum())
     return points[chosen] + rng.uniform(-0.5, 0.5, (n, 3)) * voxel, extent
-
-
-@torch.no_grad()
-def seen_weight(gaussians: Gaussians, cameras: Sequence[Camera]) -> Tensor:
-    """(n,) largest blending weight, summed over a picture's pixels, that each Gaussian has in any camera.
-
-    The gradient of a picture's sum with respect to a per-Gaussian channel of ones is that Gaussian's weight.
-    """
-    best = torch.zeros(len(gaussians))
-    for camera in cameras:
-        with torch.enable_grad():
-            ones = torch.ones((len(gaussians), 1), requires_grad=True)
-            (weight,) = torch.autograd.grad(render(gaussians, camera, channels=ones).channels.sum(), ones)
-        best = torch.maximum(best, weight[:, 0])
-    return best
 
 
 def fit(
@@ -163,7 +112,8 @@ def fit(
     start = start_from_points(points, extent / 64, generator)
     optimiser = GaussianAdam(start[morton_order(start.means)], config.rates, extent)
     _optimise(optimiser, kept, config, extent, rng, generator, report)
-    _prune_unseen(optimiser, training)
+    cameras = [v.camera for v in training]
+    optimiser.select(seen_weight(optimiser.gaussians.detached(), cameras) > 0.5)
     return _choose_sh_degree(optimiser, kept, held_back, config, extent, rng, report)
 
 
@@ -177,6 +127,7 @@ def _optimise(
     report: Report,
 ) -> None:
     white = torch.ones(3)
+    cameras = [v.camera for v in training]
     statistics = torch.zeros((len(optimiser), 3))
     order: list[int] = []
     for step in range(config.steps):
@@ -188,10 +139,10 @@ def _optimise(
         optimiser.step(progress)
         growing = step >= 200 and progress < config.densify_until
         if growing and step % config.densify_every == 0:
-            _densify(optimiser, statistics, config, extent, generator, view.camera.width)
+            grow(optimiser, statistics, config.max_gaussians, config.min_opacity, extent, generator)
             statistics = torch.zeros((len(optimiser), 3))
         if growing and step % 500 == 0:
-            _prune_unseen(optimiser, training)
+            optimiser.select(seen_weight(optimiser.gaussians.detached(), cameras) > 0.5)
             statistics = torch.zeros((len(optimiser), 3))
         if step % 50 == 0 or step == config.steps - 1:
             report(
@@ -222,30 +173,6 @@ def _view_loss(
         loss = loss + config.depth_variance_weight * depth_variance(r) / extent**2
         loss = loss + config.flatten_weight * g.scales.amin(1).mean() / extent
     return loss, image
-
-
-def _densify(
-    optimiser: GaussianAdam,
-    statistics: Tensor,
-    config: FitConfig,
-    extent: float,
-    generator: torch.Generator,
-    width: int,
-) -> None:
-    gradient = statistics[:, 0] / statistics[:, 1].clamp_min(1)
-    solid = optimiser.gaussians.opacities.detach() > config.min_opacity
-    room = config.max_gaussians - int(solid.sum())
-    optimiser.select(solid)
-    gradient = gradient[solid]
-    n_hot = min(max(room, 0), int((gradient > 0).sum()), len(optimiser) // 4)
-    hot = gradient.topk(n_hot).indices if n_hot > 0 else torch.zeros(0, dtype=torch.int64)
-    densify(optimiser, hot, 0.02 * extent, generator)
-    optimiser.select(morton_order(optimiser.gaussians.means.detach()))
-
-
-def _prune_unseen(optimiser: GaussianAdam, training: Sequence[TrainingView]) -> None:
-    seen = seen_weight(optimiser.gaussians.detached(), [v.camera for v in training])
-    optimiser.select(seen > 0.5)
 
 
 def _choose_sh_degree(
@@ -280,14 +207,3 @@ def _choose_sh_degree(
             break
         best, best_psnr = fitted, score
     return best
-
-
-@torch.no_grad()
-def mean_psnr(gaussians: Gaussians, views: Sequence[TrainingView]) -> float:
-    """Mean PSNR over views, white background, on the cropped pictures."""
-    white = torch.ones(3)
-    scores = [float(psnr(render(gaussians, v.camera, background=white).rgb, v.image[:3])) for v in views]
-    return float(np.mean(scores))
-
-
-__all__ = ["SH_C0", "FitConfig", "TrainingView", "fit", "mean_psnr", "seen_weight", "training_view"]

@@ -1,5 +1,6 @@
 """Adam over a changing set of Gaussians: densify, split, prune."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -29,12 +30,25 @@ class LearningRates:
 
 
 class GaussianAdam:
-    """Adam whose rows can be kept, dropped and added; moments follow their Gaussians."""
+    """Adam whose rows can be kept, dropped and added; moments follow their Gaussians.
 
-    def __init__(self, gaussians: Gaussians, rates: LearningRates, extent: float) -> None:
+    Args:
+        extra: further values to optimise, one row a Gaussian, each with its step size.
+    """
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        rates: LearningRates,
+        extent: float,
+        extra: Mapping[str, tuple[Tensor, float]] | None = None,
+    ) -> None:
         self.rates, self.extent = rates, extent
         self.part = gaussians.part
-        self._set({name: getattr(gaussians, name).detach().clone() for name in PARAMETERS}, {})
+        self.extra_rates = {name: rate for name, (_, rate) in (extra or {}).items()}
+        values = {name: getattr(gaussians, name) for name in PARAMETERS}
+        values |= {name: value for name, (value, _) in (extra or {}).items()}
+        self._set({name: v.detach().clone() for name, v in values.items()}, {})
 
     def _set(self, values: Mapping[str, Tensor], moments: Mapping[str, tuple[Tensor, Tensor, Tensor]]) -> None:
         self.values = {name: v.contiguous().requires_grad_() for name, v in values.items()}
@@ -49,23 +63,20 @@ class GaussianAdam:
     @property
     def gaussians(self) -> Gaussians:
         """The Gaussians as they stand; tensors are the optimised leaves themselves."""
-        return Gaussians(**self.values, part=self.part)
+        return Gaussians(**{name: self.values[name] for name in PARAMETERS}, part=self.part)
 
     def step(self, progress: float) -> None:
         """One update; ``progress`` in [0, 1] sets the decay. Gradients are cleared."""
         for group in self.adam.param_groups:
-            base = getattr(self.rates, group["name"])
-            floor = 0.01 if group["name"] == "means" else 0.1
-            scale = self.extent if group["name"] == "means" else 1.0
-            group["lr"] = base * scale * floor**progress
-        if self.values["sh"].grad is not None and self.values["sh"].shape[1] > 1:
-            # Adam is blind to gradient scale, so slow lobes by shrinking their step through the values.
-            before = self.values["sh"].detach()[:, 1:].clone()
-            self.adam.step()
-            with torch.no_grad():
-                self.values["sh"][:, 1:] = before + 0.1 * (self.values["sh"][:, 1:] - before)
-        else:
-            self.adam.step()
+            name = group["name"]
+            base = self.extra_rates[name] if name in self.extra_rates else getattr(self.rates, name)
+            floor = 0.01 if name == "means" else 0.1
+            group["lr"] = base * (self.extent if name == "means" else 1.0) * floor**progress
+        lobes = self.values["sh"].detach()[:, 1:]
+        before = lobes.clone()
+        self.adam.step()
+        # Adam is blind to gradient scale: the lobes' slower pace is a fraction of its step.
+        lobes.lerp_(before, 0.9)
         self.adam.zero_grad(set_to_none=True)
 
     def _moments(self) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
@@ -78,38 +89,33 @@ class GaussianAdam:
         self.part = self.part[index]
         self._set({n: v.detach()[index] for n, v in self.values.items()}, moments)
 
-    def append(self, new: Gaussians) -> None:
-        """Add Gaussians with fresh moments."""
+    def duplicate(self, rows: Tensor) -> None:
+        """Append copies of ``rows`` (indices) with fresh moments."""
         moments = {}
         for name, (step, m, v) in self._moments().items():
-            zeros = torch.zeros_like(getattr(new, name))
+            zeros = torch.zeros_like(m[rows])
             moments[name] = (step, torch.cat([m, zeros]), torch.cat([v, zeros]))
-        values = {n: torch.cat([v.detach(), getattr(new, n).detach()]) for n, v in self.values.items()}
-        self.part = torch.cat([self.part, new.part])
-        self._set(values, moments)
+        self.part = torch.cat([self.part, self.part[rows]])
+        self._set({n: torch.cat([v.detach(), v.detach()[rows]]) for n, v in self.values.items()}, moments)
 
 
-def densify(
-    optimiser: GaussianAdam, hot: Tensor, split_above: float, generator: torch.Generator
-) -> None:
+@torch.no_grad()
+def densify(optimiser: GaussianAdam, hot: Tensor, split_above: float, generator: torch.Generator) -> None:
     """Clone the small and split the large among the rows ``hot`` (indices).
 
     A large Gaussian (largest standard deviation above ``split_above``, scene units) becomes two of 1/1.6 its size,
     placed ± a draw from its own distribution; a small one is doubled in place.
     """
-    g = optimiser.gaussians.detached()
+    g = optimiser.gaussians
+    first_new = len(optimiser)
     large = g.scales[hot].amax(1) > split_above
-    clones, splits = g[hot[~large]], g[hot[large]]
-    noise = torch.randn(splits.means.shape, generator=generator) * splits.scales
-    offset = (wxyz_to_matrix(splits.quats) @ noise[..., None])[..., 0]
-    shrink = torch.log(torch.tensor(1.6))
-    with torch.no_grad():
-        optimiser.values["log_scales"][hot[large]] -= shrink
-        optimiser.values["means"][hot[large]] -= offset
-    splits.means += offset
-    splits.log_scales -= shrink
-    optimiser.append(clones)
-    optimiser.append(splits)
+    noise = torch.randn((int(large.sum()), 3), generator=generator) * g.scales[hot[large]]
+    offset = (wxyz_to_matrix(g.quats[hot[large]]) @ noise[..., None])[..., 0]
+    optimiser.duplicate(hot)
+    new = first_new + torch.arange(len(hot))
+    for rows, sign in ((hot[large], -1.0), (new[large], 1.0)):
+        optimiser.values["log_scales"][rows] -= math.log(1.6)
+        optimiser.values["means"][rows] += sign * offset
 
 
 def morton_order(points: Tensor) -> Tensor:

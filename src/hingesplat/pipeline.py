@@ -103,6 +103,7 @@ def preset(name: PresetName) -> ReconstructConfig:
                 fit=replace(
                     config.fit, steps=30_000, start_gaussians=50_000, max_gaussians=500_000, max_sh_degree=3
                 ),
+                fuse=replace(config.fuse, strategy="global"),
                 articulate=replace(config.articulate, steps=20_000),
                 mesh=replace(config.mesh, views=100, image_size=400, resolution=256),
             )
@@ -239,8 +240,8 @@ def _fuse(run: Run) -> None:
 def initial_transforms(T_1_0: np.ndarray, states: int) -> np.ndarray:
     """T_state_0 (states, parts, 4, 4) to start from.
 
-    ``T_1_0`` (parts, 4, 4) are the motions from the first state to the last, the identity for the base. States
-    between the two start where state 0 is.
+    ``T_1_0`` (parts, 4, 4) are the motions from the first state to the last, the identity for the base.
+    States between the two start where state 0 is.
     """
     T_state_0 = np.tile(np.eye(4), (states, len(T_1_0), 1, 1))
     T_state_0[-1] = T_1_0
@@ -356,8 +357,8 @@ def _check_explained(run: Run, found: Segmentation, last: int) -> None:
         share = found.unexplained if found.motions else 1.0
         raise HingesplatError(
             f"{run.capture.path}: no rigid parts explain {share:.0%} of what moved between state 0 and "
-            f"state {last}; check that the poses of both states share one frame, that the masks hold the object "
-            "only, and that its parts are rigid"
+            f"state {last}; check that the poses of both states share one frame, that the masks hold the "
+            "object only, and that its parts are rigid"
         )
 
 

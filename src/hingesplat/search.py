@@ -36,7 +36,13 @@ class ScoreVolume:
 
 
 def score_volume(
-    points: np.ndarray, colours: np.ndarray, here: Sight, other: Sight, low: np.ndarray, high: np.ndarray, cells: int
+    points: np.ndarray,
+    colours: np.ndarray,
+    here: Sight,
+    other: Sight,
+    low: np.ndarray,
+    high: np.ndarray,
+    cells: int,
 ) -> ScoreVolume:
     """Score volume of the state seen by ``here``, whose surface is sampled by points (n, 3) with colours (n, 3).
 
@@ -76,7 +82,9 @@ HIDDEN32 = np.float32(HIDDEN_SCORE)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def _sum(q, colours, shift, origin, inverse_voxel, score, volume_colour, give_up):  # pragma: no cover - compiled
+def _sum(
+    q, colours, shift, origin, inverse_voxel, score, volume_colour, give_up
+):  # pragma: no cover - compiled
     """Mean score of points q + shift; surfaces count by how constant the colour difference is (shading may shift it)."""
     nx, ny, nz = score.shape
     m = q.shape[0]
@@ -172,7 +180,14 @@ def _scan_revolute(
                 for a in range(3):
                     shift[a] = ta * u[a] + tb * w[a]
                 s = _sum(
-                    q, colours, shift, origin, np.float32(1 / voxel), score, volume_colour, max(top, np.float32(0)) * 0.4
+                    q,
+                    colours,
+                    shift,
+                    origin,
+                    np.float32(1 / voxel),
+                    score,
+                    volume_colour,
+                    max(top, np.float32(0)) * 0.4,
                 )
                 if s > top:
                     top = s
@@ -257,7 +272,11 @@ def scan(
             for i, j in np.ndindex(score.shape)
         ]
     if "prismatic" in kinds:
-        slides = values if values is not None else both_signs(np.arange(1, 1.2 * reach / volume.voxel, 0.5) * volume.voxel)
+        slides = (
+            values
+            if values is not None
+            else both_signs(np.arange(1, 1.2 * reach / volume.voxel, 0.5) * volume.voxel)
+        )
         score = _scan_prismatic(seeds32, colours32, directions, slides, *grid)
         found += [
             Motion("prismatic", directions[i], centroid, float(slides[j]), float(score[i, j]))

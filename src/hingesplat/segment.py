@@ -197,7 +197,9 @@ def refine_motion(
         np.radians(spread_deg) if motion.kind == "revolute" else 2 * volume.voxel
     )
     kinds = (motion.kind,)
-    (straight,) = scan(points, colours, motion.axis[None], volume, kinds=kinds, values=values, near=motion, keep=1)
+    (straight,) = scan(
+        points, colours, motion.axis[None], volume, kinds=kinds, values=values, near=motion, keep=1
+    )
     (best,) = scan(points, colours, tilted, volume, kinds=kinds, values=values, near=motion, keep=1)
     # The volume is coarse: an axis is tilted only for a clear gain, and the photographs settle the rest later.
     return best if best.score > straight.score + 0.02 else straight
@@ -218,7 +220,12 @@ def label_costs(
         free, seen, hidden = answer[:, FREE] / views, answer[:, SURFACE] / views, answer[:, HIDDEN] / views
         contradiction = np.clip(free / 0.25, 0, 1)
         colour = np.clip((answer[:, COLOUR] - 0.05) / 0.5, 0, 1) * seen / np.maximum(seen + hidden, 1e-6)
-        columns.append(contradiction + 0.5 * colour + hidden_cost * hidden + (0.0 if motion is None else 0.1 + 0.1 * travel))
+        columns.append(
+            contradiction
+            + 0.5 * colour
+            + hidden_cost * hidden
+            + (0.0 if motion is None else 0.1 + 0.1 * travel)
+        )
     return np.stack(columns, 1)
 
 
@@ -251,11 +258,16 @@ class Labelling:
     @staticmethod
     def of(surfaces: tuple[Surface, Surface], extent: float) -> "Labelling":
         w0, w1 = (neighbour_weights(s.points, s.colours, 0.025 * extent) for s in surfaces)
-        return Labelling(surfaces, (w0, w1), (cKDTree(surfaces[0].points), cKDTree(surfaces[1].points)), extent)
+        return Labelling(
+            surfaces, (w0, w1), (cKDTree(surfaces[0].points), cKDTree(surfaces[1].points)), extent
+        )
 
     def costs(self, motions: Sequence[Motion]) -> list[np.ndarray]:
         a, b = self.surfaces
-        return [label_costs(a, b.sight, motions, forward=True), label_costs(b, a.sight, motions, forward=False)]
+        return [
+            label_costs(a, b.sight, motions, forward=True),
+            label_costs(b, a.sight, motions, forward=False),
+        ]
 
     def partners(self, motions: Sequence[Motion]) -> list[np.ndarray]:
         """(n_s, 1 + motions): the other state's point with which each point coincides under each label, or −1."""
@@ -338,7 +350,10 @@ def segment(
     rng = np.random.default_rng(seed)
     low, high = bounds([g.means.numpy() for g in gaussians])
     extent = float((high - low).max())
-    sights = [look(g, v, config.sight_size, config.tolerance * extent) for g, v in zip(gaussians, views, strict=True)]
+    sights = [
+        look(g, v, config.sight_size, config.tolerance * extent)
+        for g, v in zip(gaussians, views, strict=True)
+    ]
     surfaces = (on_surface(gaussians[0], sights[0]), on_surface(gaussians[1], sights[1]))
     seeds = []
     for s in (0, 1):
@@ -347,7 +362,9 @@ def segment(
         seeds.append(index[thin(surface.points[index], 0.012 * extent, rng)])
 
     def volume(s: int, cells: int) -> ScoreVolume:
-        return score_volume(surfaces[s].points, surfaces[s].colours, sights[s], sights[1 - s], low, high, cells)
+        return score_volume(
+            surfaces[s].points, surfaces[s].colours, sights[s], sights[1 - s], low, high, cells
+        )
 
     coarse, fine = [volume(s, config.cells) for s in (0, 1)], [volume(s, 2 * config.cells) for s in (0, 1)]
     pool = propose(surfaces, seeds, coarse, fine, extent, config, rng)
@@ -371,7 +388,13 @@ def segment(
     for round_ in range(config.rounds):
         chosen = [
             _refit(m, own, surfaces, fine, 6.0 / 2**round_, config, rng)
-            for m, own in _owners(chosen, costs_of(chosen), [s[: config.max_seeds] for s in seeds], config, owned if round_ else None)
+            for m, own in _owners(
+                chosen,
+                costs_of(chosen),
+                [s[: config.max_seeds] for s in seeds],
+                config,
+                owned if round_ else None,
+            )
         ]
         chosen, owned = problem.solve(chosen, config.part_cost * 2, parts)
     chosen, owned = split_pieces(chosen, owned, surfaces, extent, config)
@@ -390,7 +413,10 @@ def _owners(
 ) -> list[tuple[Motion, tuple[np.ndarray, np.ndarray]]]:
     """Each motion with the surface points of both states to refine it on: its labelled points, or at first its seeds."""
     if owned is not None:
-        return [(m, (np.flatnonzero(owned[0] == k + 1), np.flatnonzero(owned[1] == k + 1))) for k, m in enumerate(motions)]
+        return [
+            (m, (np.flatnonzero(owned[0] == k + 1), np.flatnonzero(owned[1] == k + 1)))
+            for k, m in enumerate(motions)
+        ]
     owner = np.where(costs.min(1) < config.explained_cost, costs.argmin(1), -1)
     first, second = owner[: len(seeds[0])], owner[len(seeds[0]) :]
     return [(m, (seeds[0][first == k], seeds[1][second == k])) for k, m in enumerate(motions)]

@@ -1,0 +1,107 @@
+"""What every optimisation loop shares: prepared photographs, depth regularisers, growing and pruning the set."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hingesplat.camera import Camera
+from hingesplat.capture import View
+from hingesplat.gaussians import Gaussians
+from hingesplat.losses.photometric import Target, psnr
+from hingesplat.optim import GaussianAdam, densify, morton_order
+from hingesplat.render import Rendering, render
+
+Report = Callable[..., None]
+"""Called now and then with ``step, steps, loss, psnr, gaussians``."""
+
+
+@dataclass(frozen=True)
+class TrainingView:
+    """A photograph ready for the loop: cropped to the object, over white, with its alpha as a fourth plane."""
+
+    camera: Camera
+    target: Target
+    image: Tensor
+    """(4, h, w): rgb over white, alpha."""
+
+
+def training_view(view: View, margin: int = 8) -> TrainingView:
+    """Crop to the mask's rectangle plus a margin: what lies outside is background in every render, too."""
+    alpha = view.rgba[..., 3]
+    height, width = alpha.shape
+    rows, columns = np.flatnonzero(alpha.max(1)), np.flatnonzero(alpha.max(0))
+    if len(rows) == 0:
+        rows, columns = np.array([0, height - 1]), np.array([0, width - 1])
+    x0, x1 = max(columns[0] - margin, 0), min(columns[-1] + margin + 1, width)
+    y0, y1 = max(rows[0] - margin, 0), min(rows[-1] + margin + 1, height)
+    rgba = torch.from_numpy(view.rgba[y0:y1, x0:x1].astype(np.float32) / 255).permute(2, 0, 1)
+    image = torch.cat([rgba[:3] * rgba[3:] + 1 - rgba[3:], rgba[3:]]).contiguous()
+    camera = view.camera.cropped(int(x0), int(y0), int(x1 - x0), int(y1 - y0))
+    return TrainingView(camera, Target.of(image), image)
+
+
+def four_planes(rendering: Rendering) -> Tensor:
+    """Rgb and alpha of a rendering as (4, h, w), to compare with ``TrainingView.image``."""
+    return torch.cat([rendering.rgb, rendering.alpha[None]])
+
+
+def depth_and_its_square(means: Tensor, camera: Camera) -> Tensor:
+    """(n, 1) squared depth of each centre: the extra channel from which ``depth_variance`` is made."""
+    row = torch.as_tensor(camera.T_camera_world[2], dtype=means.dtype)
+    return (means @ row[:3] + row[3]).square()[:, None]
+
+
+def depth_variance(rendering: Rendering) -> Tensor:
+    """Mean over covered pixels of the variance of depth along the ray, scene units squared."""
+    alpha = rendering.alpha.clamp_min(1e-3)
+    mean = rendering.depth / alpha
+    variance = (rendering.channels[0] / alpha - mean.square()).clamp_min(0)
+    return (variance * (rendering.alpha > 0.5)).mean()
+
+
+def grow(
+    optimiser: GaussianAdam,
+    statistics: Tensor,
+    max_gaussians: int,
+    min_opacity: float,
+    extent: float,
+    generator: torch.Generator,
+) -> None:
+    """Drop the faint, then densify where the picture pulls hardest on centres, up to ``max_gaussians``.
+
+    ``statistics`` is the (n, 3) buffer that ``rasterize`` fills: summed screen gradient, number of views, radius.
+    """
+    gradient = statistics[:, 0] / statistics[:, 1].clamp_min(1)
+    solid = optimiser.gaussians.opacities.detach() > min_opacity
+    optimiser.select(solid)
+    gradient = gradient[solid]
+    room = max(max_gaussians - len(optimiser), 0)
+    n_hot = min(room, int((gradient > 0).sum()), len(optimiser) // 4)
+    densify(optimiser, gradient.topk(n_hot).indices, 0.02 * extent, generator)
+    optimiser.select(morton_order(optimiser.gaussians.means.detach()))
+
+
+@torch.no_grad()
+def seen_weight(gaussians: Gaussians, cameras: Sequence[Camera]) -> Tensor:
+    """(n,) largest blending weight, summed over a picture's pixels, that each Gaussian has in any camera.
+
+    The gradient of a picture's sum with respect to a per-Gaussian channel of ones is that Gaussian's weight.
+    """
+    best = torch.zeros(len(gaussians))
+    for camera in cameras:
+        with torch.enable_grad():
+            ones = torch.ones((len(gaussians), 1), requires_grad=True)
+            (weight,) = torch.autograd.grad(render(gaussians, camera, channels=ones).channels.sum(), ones)
+        best = torch.maximum(best, weight[:, 0])
+    return best
+
+
+@torch.no_grad()
+def mean_psnr(gaussians: Gaussians, views: Sequence[TrainingView]) -> float:
+    """Mean PSNR over views, white background, on the cropped pictures."""
+    white = torch.ones(3)
+    scores = [float(psnr(render(gaussians, v.camera, background=white).rgb, v.image[:3])) for v in views]
+    return float(np.mean(scores))
