@@ -120,7 +120,7 @@ BAD: dict[str, tuple[Callable[[Path], object], list[str]]] = {
         ["003.png", "31×48"],
     ),
     "no mask": (opaque, ["no mask", "--masks"]),
-    "NaN pose": (lambda c: poses(c, with_nan, slice(1, 2)), ["transforms_train.json", "frame 1", "finite"]),
+    "NaN pose": (lambda c: poses(c, with_nan, slice(1, 2)), ["transforms_train.json", "frame 1", "NaN"]),
     "stretched pose": (lambda c: poses(c, lambda T: T * 2, slice(4, 5)), ["frame 4", "rigid"]),
     "frames apart": (lambda c: poses(c, shifted), ["state_1", "frame"]),
     "few views": (lambda c: edit_json(c / "state_0/transforms_train.json", few), ["state_0", "2", "3"]),

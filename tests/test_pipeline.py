@@ -249,7 +249,7 @@ def test_identical_states_give_a_static_twin(cabinet: Path, tmp_path: Path) -> N
 
 
 def test_a_door_and_a_drawer_from_photographs_alone(cabinet: Path, capture: Capture, tmp_path: Path) -> None:
-    """Neither the number of parts nor the types of joints are told. Bounds are loose: it is 96 pixels small."""
+    """Neither the number of parts nor the types of joints are told. The bounds are loose: 96 pixels."""
     run = tmp_path / "run"
     twin = reconstruct(capture, small_config(), out=run)
     assert sorted(j.type for j in twin.joints) == ["prismatic", "revolute"]

@@ -14,21 +14,13 @@ from hingesplat.gaussians import Gaussians
 from hingesplat.losses.articulation import articulation_loss
 from hingesplat.losses.contact import contact_loss
 from hingesplat.losses.part import nearest_neighbours, part_loss, part_probabilities, soft_motion
-from hingesplat.losses.photometric import photometric, psnr
+from hingesplat.losses.photometric import psnr
 from hingesplat.losses.repel import repel_force, sample_repel_points
 from hingesplat.losses.vector_field import vector_loss
 from hingesplat.losses.velocity import fit_parts, velocity_loss
 from hingesplat.optim import GaussianAdam, LearningRates
-from hingesplat.poses import PoseDelta, draw_state
-from hingesplat.training import (
-    Report,
-    TrainingView,
-    depth_and_its_square,
-    depth_variance,
-    four_planes,
-    grow,
-    training_view,
-)
+from hingesplat.poses import PoseDelta, StateLossConfig, move, part_centres, state_loss
+from hingesplat.training import Report, grow, training_view
 
 
 @dataclass(frozen=True)
@@ -41,14 +33,7 @@ class ArticulateConfig:
     """Cap on the number of canonical Gaussians."""
     pose_rate: float = 2e-3
     """Adam step of the part poses (radians, extents) at the start; decays to 2 %."""
-    ssim_weight: float = 0.2
-    """Weight of 1 − SSIM in L_render."""
-    depth_variance_weight: float = 20.0
-    """Pulls the weight along each ray to one depth."""
-    flatten_weight: float = 0.5
-    """Shrinks each Gaussian's thinnest axis."""
-    state_colour_weight: float = 0.02
-    """Price of a colour that differs between states (light and shadow move with the parts)."""
+    render: StateLossConfig = field(default_factory=StateLossConfig)
     densify_every: int = 150
     """Steps between densifications."""
     min_opacity: float = 0.02
@@ -123,9 +108,7 @@ def articulate(
     low, high = np.quantile(canonical.means.numpy(), [0.002, 0.998], axis=0)
     extent = float((high - low).max())
     parts = T_state_0.shape[1]
-    centres = torch.stack(
-        [canonical.means[canonical.part == k].mean(0) if (canonical.part == k).any() else torch.zeros(3) for k in range(parts)]
-    )
+    centres = part_centres(canonical, parts)
     poses = PoseDelta(torch.from_numpy(T_state_0).float(), centres, extent)
     pose_adam = torch.optim.Adam(poses.parameters, lr=config.pose_rate)
     identity = _Identity(canonical, parts, config, generator)
@@ -148,7 +131,9 @@ def articulate(
         if fitted and step % 200 == 0 and (config.art_weight or config.vector_weight):
             targets = _match(optimiser.gaussians, poses, fitted, extent)
         means = _moved(optimiser.gaussians, R[state], t[state], p, repel_points, config)
-        loss, image = _render_loss(optimiser, R[state], t[state], means, view, state, config, extent, statistics)
+        loss, image = state_loss(
+            optimiser, R[state], t[state], view, state, config.render, extent, means=means, statistics=statistics
+        )
         loss = loss + identity.loss(optimiser, p, step)
         loss = loss + _physics(optimiser.gaussians, R, t, p, targets, config, extent, state, generator)
         loss.backward()
@@ -198,40 +183,6 @@ def _moved(
         return means
     force = repel_force(means, repel_points)
     return means + force * (1 - p[:, :1])
-
-
-def _render_loss(
-    optimiser: GaussianAdam,
-    R: Tensor,
-    t: Tensor,
-    means: Tensor | None,
-    view: TrainingView,
-    state: int,
-    config: ArticulateConfig,
-    extent: float,
-    statistics: Tensor | None,
-) -> tuple[Tensor, Tensor]:
-    g = optimiser.gaussians
-    offset = optimiser.values["state_sh"][:, state - 1] if state else None
-    at = means if means is not None else (R[g.part] @ g.means[..., None])[..., 0] + t[g.part]
-    r = draw_state(
-        g,
-        R,
-        t,
-        view.camera,
-        sh_offset=offset,
-        means=at,
-        background=torch.ones(3),
-        channels=depth_and_its_square(at, view.camera),
-        screen_gradient=statistics,
-    )
-    image = four_planes(r)
-    loss = photometric(image, view.target, config.ssim_weight)
-    loss = loss + config.depth_variance_weight * depth_variance(r) / extent**2
-    loss = loss + config.flatten_weight * g.scales.amin(1).mean() / extent
-    if offset is not None:
-        loss = loss + config.state_colour_weight * offset.abs().mean()
-    return loss, image
 
 
 class _Identity:
@@ -287,7 +238,7 @@ def _match(g: Gaussians, poses: PoseDelta, fitted: Sequence[Gaussians], extent: 
     R, t = poses.Rt()
     matches = []
     for state, own in enumerate(fitted):
-        moved = (R[state][g.part] @ g.means[..., None])[..., 0] + t[state][g.part]
+        moved = move(g.means, g.part, R[state], t[state])
         distance, index = cKDTree(own.means.numpy()).query(moved.numpy())
         rows = np.flatnonzero(distance < 0.02 * extent)
         matches.append(_Targets(torch.from_numpy(rows), own.means[torch.from_numpy(index[rows])]))

@@ -196,7 +196,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         command = parse(list(sys.argv[1:] if argv is None else argv))
         console = Console(quiet=command.quiet, highlight=False)
         with _logging_to(console):
-            _use_all_cores()
+            use_all_cores()
             command.run(console)
         return 0
     except SystemExit as e:  # Help, or options that make no sense; tyro has said so.
@@ -468,7 +468,7 @@ def _write_traceback(command: Command | None) -> Path:
     return path
 
 
-def _use_all_cores() -> None:
+def use_all_cores() -> None:
     """Torch takes half of the hardware threads by itself; an explicit OMP_NUM_THREADS wins."""
     if "OMP_NUM_THREADS" not in os.environ:
         import torch

@@ -1,12 +1,17 @@
 """Differentiable part poses, and the Gaussians of one state drawn with them."""
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
 from hingesplat.camera import Camera
 from hingesplat.gaussians import Gaussians
+from hingesplat.losses.photometric import photometric
+from hingesplat.optim import GaussianAdam
 from hingesplat.render import Rendering, rasterize, sh_to_rgb
 from hingesplat.se3 import matrix_to_wxyz, quat_multiply, rotvec_to_matrix
+from hingesplat.training import TrainingView, depth_and_its_square, depth_variance, four_planes
 
 
 class PoseDelta:
@@ -68,3 +73,64 @@ def draw_state(
 def move(means: Tensor, part: Tensor, R: Tensor, t: Tensor) -> Tensor:
     """Centres (n, 3) under their own part's pose."""
     return (R[part] @ means[..., None])[..., 0] + t[part]
+
+
+def part_centres(g: Gaussians, parts: int) -> Tensor:
+    """(parts, 3) mean centre of each part's Gaussians; the origin for a part without any."""
+    total = g.means.new_zeros((parts, 3)).index_add_(0, g.part, g.means)
+    return total / torch.bincount(g.part, minlength=parts).clamp_min(1)[:, None]
+
+
+@dataclass(frozen=True)
+class StateLossConfig:
+    """What one photograph of one state asks of the canonical Gaussians."""
+
+    ssim_weight: float = 0.2
+    """Weight of 1 − SSIM; the rest is L1 (paper: 0.2)."""
+    depth_variance_weight: float = 20.0
+    """Pulls the weight along each ray to one depth."""
+    flatten_weight: float = 0.5
+    """Shrinks each Gaussian's thinnest axis."""
+    state_colour_weight: float = 0.02
+    """Price of a colour that differs between states (light and shadow move with the parts)."""
+
+
+def state_loss(
+    optimiser: GaussianAdam,
+    R: Tensor,
+    t: Tensor,
+    view: TrainingView,
+    state: int,
+    config: StateLossConfig,
+    extent: float,
+    *,
+    means: Tensor | None = None,
+    statistics: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """L_render and its regularisers for one photograph, and the (4, h, w) picture it judges.
+
+    Args:
+        optimiser: holds the Gaussians, and ``state_sh`` (n, states − 1, 3).
+        R, t: this state's part poses.
+    """
+    g = optimiser.gaussians
+    offset = optimiser.values["state_sh"][:, state - 1] if state else None
+    at = means if means is not None else move(g.means, g.part, R, t)
+    r = draw_state(
+        g,
+        R,
+        t,
+        view.camera,
+        sh_offset=offset,
+        means=at,
+        background=torch.ones(3),
+        channels=depth_and_its_square(at, view.camera),
+        screen_gradient=statistics,
+    )
+    image = four_planes(r)
+    loss = photometric(image, view.target, config.ssim_weight)
+    loss = loss + config.depth_variance_weight * depth_variance(r) / extent**2
+    loss = loss + config.flatten_weight * g.scales.amin(1).mean() / extent
+    if offset is not None:
+        loss = loss + config.state_colour_weight * offset.abs().mean()
+    return loss, image

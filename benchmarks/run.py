@@ -1,0 +1,148 @@
+"""Measure everything: the demo, the rasteriser, and captures where a folder of them is given.
+
+    python benchmarks/run.py [--captures DIR] [--seeds 0 1 2] [--readme README.md]
+
+Writes ``benchmarks/results/*.json`` and sets the table between the marks in the README. Leave the machine
+alone meanwhile.
+"""
+
+import os
+import platform
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from captures import Options as CaptureOptions
+from captures import by_capture, call, cells, measure_all, results, save
+from rich.console import Console
+
+from hingesplat import cli
+from hingesplat.camera import Camera
+from hingesplat.gaussians import Gaussians
+from hingesplat.render import render
+
+START, END = "<!-- results -->", "<!-- /results -->"
+LEFT_OUT = ("fit s", "segment s", "joint s", "rest s")
+"""Columns of ``captures.cells`` that the README does without."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to measure beside the demo."""
+
+    captures: Path | None = None
+    """Folder whose folders are captures, each with truth/ inside."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    readme: Path | None = None
+    """File whose table is set."""
+
+
+def demo() -> list[dict[str, Any]]:
+    """The demo twice, in processes of their own: the second run has everything compiled."""
+    rows = []
+    with tempfile.TemporaryDirectory(prefix="hingesplat-demo-") as folder:
+        for _ in range(2):
+            started = time.perf_counter()
+            error = call("demo", "--out", folder)
+            row = {"capture": "demo", "wall_seconds": round(time.perf_counter() - started, 1)}
+            rows.append(row | ({"error": error} if error else results(Path(folder) / "run")))
+    return rows
+
+
+def rasteriser(n: int = 10_000, size: int = 400, repeats: int = 10) -> dict[str, float]:
+    """Milliseconds of a picture of n random Gaussians, and of one with its gradients; best of ``repeats``."""
+    generator = torch.Generator().manual_seed(0)
+    ball = torch.nn.functional.normalize(torch.randn((n, 3), generator=generator), dim=1) * 0.5
+    gaussians = Gaussians(
+        means=ball,
+        quats=torch.randn((n, 4), generator=generator),
+        log_scales=torch.full((n, 3), float(np.log(0.01))),
+        logit_opacities=torch.full((n,), 2.0),
+        sh=torch.randn((n, 1, 3), generator=generator),
+        part=torch.zeros(n, dtype=torch.int64),
+    )
+    pose = np.eye(4)
+    pose[2, 3] = -2
+    camera = Camera(pose, 1.2 * size, 1.2 * size, size / 2, size / 2, size, size)
+    gaussians.means.requires_grad_()
+    gaussians.sh.requires_grad_()
+    forward, both = [], []
+    for _ in range(repeats + 1):  # The first one compiles.
+        started = time.perf_counter()
+        picture = render(gaussians, camera, backend="numba").rgb
+        forward.append(time.perf_counter() - started)
+        picture.square().mean().backward()
+        both.append(time.perf_counter() - started)
+    return {
+        "gaussians": n,
+        "size": size,
+        "forward_ms": round(1000 * min(forward[1:]), 2),
+        "forward_backward_ms": round(1000 * min(both[1:]), 2),
+    }
+
+
+def markdown(rows: Sequence[dict[str, Any]], raster: dict[str, float]) -> str:
+    """The table for the README with what stands around it."""
+    groups = by_capture(rows)
+    lines = [cells(group) for group in groups]
+    head = [title for title in max(lines, key=len) if title not in LEFT_OUT]
+    table = ["| " + " | ".join([*head, "given"]) + " |", "|---" * (len(head) + 1) + "|"]
+    for line, group in zip(lines, groups, strict=True):
+        given = next((r["summary"]["given"] for r in group if "summary" in r), {})
+        told = ", ".join(k for k, v in given.items() if v) or "nothing"
+        table.append("| " + " | ".join([*(line.get(title, "") for title in head), told]) + " |")
+    seeds = sorted({r["summary"]["seed"] for r in rows if "summary" in r})
+    notes = (
+        "Axis, position and motion are those of a capture's worst joint; one that was not found counts 90°.",
+        f"Seeds: {', '.join(map(str, seeds)) or '–'}; ± is the standard deviation over them.",
+        f"Machine: {machine()}.",
+        f"Rasteriser, {raster['gaussians']} Gaussians at {raster['size']}×{raster['size']} pixels:",
+        f"{raster['forward_ms']:.1f} ms a picture, {raster['forward_backward_ms']:.1f} ms with gradients.",
+    )
+    return "\n".join([*table, "", *notes])
+
+
+def machine() -> str:
+    processor = f"{os.cpu_count()} × {platform.machine()}"
+    return f"{processor}, Python {platform.python_version()}, torch {torch.__version__}"
+
+
+def set_table(readme: Path, table: str) -> None:
+    """Replace what stands between the two marks."""
+    text = readme.read_text()
+    if START not in text or END not in text:
+        raise SystemExit(f"{readme}: lacks the marks {START} and {END}")
+    before, after = text.split(START)[0], text.split(END)[1]
+    tmp = readme.with_name(readme.name + ".tmp")
+    tmp.write_text(f"{before}{START}\n{table}\n{END}{after}")
+    tmp.replace(readme)
+
+
+def main() -> None:
+    options = tyro.cli(Options, description=__doc__)
+    console = Console()
+    cli.use_all_cores()
+    raster = rasteriser()
+    save("rasteriser", raster | {"machine": machine()})
+    console.print(raster)
+    rows = demo()
+    save("demo", rows)
+    rows = rows[-1:]
+    if options.captures is not None:
+        more = measure_all(CaptureOptions(options.captures, seeds=options.seeds), console)
+        save("captures", more)
+        rows += more
+    table = markdown(rows, raster)
+    console.print(table, soft_wrap=True, markup=False)
+    if options.readme is not None:
+        set_table(options.readme, table)
+
+
+if __name__ == "__main__":
+    main()

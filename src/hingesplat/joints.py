@@ -1,0 +1,363 @@
+"""From rigid motions to joints: the type by model comparison, then a refinement with one degree of freedom (section 6)."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hingesplat.capture import View
+from hingesplat.gaussians import Gaussians
+from hingesplat.losses.photometric import photometric, psnr
+from hingesplat.optim import GaussianAdam, LearningRates
+from hingesplat.poses import StateLossConfig, draw_state, part_centres, state_loss
+from hingesplat.screw import matrix_to_screw
+from hingesplat.se3 import rotvec_to_matrix
+from hingesplat.training import Report, TrainingView, four_planes, training_view
+from hingesplat.twin import Joint, JointStd, JointType
+
+
+@dataclass(frozen=True)
+class JointsConfig:
+    """Joint types, and the last refinement."""
+
+    type_steps: int = 60
+    """Steps of each type's trial, Gaussians frozen."""
+    type_significance: float = 2.0
+    """A rotation must beat a slide by this many standard errors, since it has more numbers to fit with."""
+    steps: int = 500
+    """Steps of the constrained refinement, everything together."""
+    rate: float = 1e-3
+    """Adam step of the joint parameters (radians, extents) at the start; decays to 2 %."""
+    uncertainty_views: int = 12
+    """Photographs of each moved state from which standard deviations are made; 0 skips them."""
+    render: StateLossConfig = field(default_factory=StateLossConfig)
+    rates: LearningRates = field(
+        default_factory=lambda: LearningRates(means=3e-4, quats=1e-3, log_scales=2e-3, logit_opacities=1e-2, sh=3e-3)
+    )
+
+
+@dataclass(frozen=True)
+class JointResult:
+    """The finished model."""
+
+    gaussians: Gaussians
+    """In the frame of state 0."""
+    state_sh: Tensor
+    """(states, n, 3) offset of the constant colour coefficient in each state."""
+    joints: tuple[Joint, ...]
+
+
+class JointPoses:
+    """Part poses with one degree of freedom each: an axis, a pivot, and a value a state."""
+
+    def __init__(
+        self, types: Sequence[str], axes: np.ndarray, pivots: np.ndarray, values: np.ndarray, extent: float
+    ) -> None:
+        """``axes`` and ``pivots`` (joints, 3); ``values`` (states − 1, joints), radians or scene units."""
+        self.extent = extent
+        self.revolute = torch.tensor([kind == "revolute" for kind in types])
+        basis = []
+        for axis in axes:
+            u = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+            u /= np.linalg.norm(u)
+            basis.append(np.stack([u, np.cross(axis, u)]))
+        self.across = torch.from_numpy(np.stack(basis)).float()
+        self.axis0 = torch.from_numpy(axes).float()
+        self.pivot0 = torch.from_numpy(pivots).float()
+        self.value0 = torch.from_numpy(values).float()
+        unit = torch.where(self.revolute, 1.0, extent)
+        self.unit = unit
+        # Two tilts of the axis, two shifts of the pivot across it, then a change of the value in every state.
+        self.theta = torch.zeros((len(types), 4 + len(values)), requires_grad=True)
+
+    def axis(self) -> Tensor:
+        tilt = (self.theta[:, :2, None] * self.across).sum(1)
+        return torch.nn.functional.normalize(self.axis0 + tilt, dim=1)
+
+    def pivot(self) -> Tensor:
+        return self.pivot0 + self.extent * (self.theta[:, 2:4, None] * self.across).sum(1)
+
+    def values(self) -> Tensor:
+        """(states, joints); zero in state 0."""
+        moved = self.value0 + self.theta[:, 4:].T * self.unit
+        return torch.cat([torch.zeros_like(moved[:1]), moved])
+
+    def Rt(self) -> tuple[Tensor, Tensor]:
+        """Rotations (states, 1 + joints, 3, 3) and translations (states, 1 + joints, 3); the base first."""
+        axis, pivot, value = self.axis(), self.pivot(), self.values()
+        angle = value * self.revolute
+        R = rotvec_to_matrix(angle[..., None] * axis)
+        turn = pivot - (R @ pivot[..., None])[..., 0]
+        t = torch.where(self.revolute[:, None], turn, value[..., None] * axis)
+        eye = torch.eye(3).expand(len(value), 1, 3, 3)
+        return torch.cat([eye, R], 1), torch.cat([torch.zeros((len(value), 1, 3)), t], 1)
+
+
+def closest_joint(kind: str, T: np.ndarray, centroid: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Axis (3,), pivot (3,) and values (states − 1,) of the joint of one type nearest to motions T (states − 1, 4, 4).
+
+    The state that moved most sets the axis; the others get their best value on it.
+    """
+    ends = T[:, :3, :3] @ centroid + T[:, :3, 3]
+    if kind == "prismatic":
+        shifts = ends - centroid
+        axis = shifts[np.linalg.norm(shifts, axis=1).argmax()]
+        axis = axis / max(float(np.linalg.norm(axis)), 1e-12)
+        return axis, centroid, shifts @ axis
+    screws = [matrix_to_screw(M, centroid) for M in T]
+    most = screws[int(np.argmax([s.angle for s in screws]))]
+    return most.axis, most.pivot, np.array([s.angle * np.sign(s.axis @ most.axis or 1) for s in screws])
+
+
+def find_joints(
+    gaussians: Gaussians,
+    T_state_0: np.ndarray,
+    state_sh: Tensor,
+    views: Sequence[Sequence[View]],
+    config: JointsConfig,
+    *,
+    seed: int = 0,
+    report: Report = lambda **_: None,
+) -> JointResult:
+    """Each part's motions to one joint, and everything refined with the joints as constraints.
+
+    Args:
+        gaussians: canonical, frame of state 0.
+        T_state_0: (states, parts, 4, 4) free rigid motions.
+        state_sh: (states, n, 3) colour offsets.
+    """
+    rng = np.random.default_rng(seed)
+    low, high = np.quantile(gaussians.means.numpy(), [0.002, 0.998], axis=0)
+    extent = float((high - low).max())
+    n_parts = T_state_0.shape[1]
+    if n_parts == 1:
+        return JointResult(gaussians, state_sh, ())
+    training = [[training_view(v) for v in state] for state in views]
+    centroids = part_centres(gaussians, n_parts).double().numpy()[1:]
+
+    def poses_of(kinds: Sequence[str]) -> JointPoses:
+        start = [closest_joint(k, T_state_0[1:, i + 1], centroids[i]) for i, k in enumerate(kinds)]
+        axes, pivots, values = (np.stack(column) for column in zip(*start, strict=True))
+        return JointPoses(kinds, axes, pivots, values.T, extent)
+
+    kinds, confidence = _choose_types(gaussians, state_sh, training, poses_of, n_parts - 1, config, rng)
+    poses = poses_of(kinds)
+    extra = {"state_sh": (state_sh[1:].permute(1, 0, 2), config.rates.sh)}
+    optimiser = GaussianAdam(gaussians, config.rates, extent, extra)
+    adam = torch.optim.Adam([poses.theta], lr=config.rate)
+    queue: list[tuple[int, int]] = []
+    for step in range(config.steps):
+        progress = step / config.steps
+        if not queue:
+            queue = [(s, i) for s, state in enumerate(training) for i in range(len(state))]
+            rng.shuffle(queue)
+        state, index = queue.pop()
+        view = training[state][index]
+        R, t = poses.Rt()
+        loss, image = state_loss(optimiser, R[state], t[state], view, state, config.render, extent)
+        loss.backward()
+        optimiser.step(progress)
+        _joint_step(adam, config.rate, progress)
+        if step % 50 == 0 or step == config.steps - 1:
+            report(
+                step=step + 1,
+                steps=config.steps,
+                loss=float(loss.detach()),
+                psnr=float(psnr(image.detach()[:3], view.image[:3])),
+                gaussians=len(optimiser),
+            )
+    finished = optimiser.gaussians.detached()
+    offsets = optimiser.values["state_sh"].detach().permute(1, 0, 2)
+    all_sh = torch.cat([torch.zeros_like(offsets[:1]), offsets]).contiguous()
+    deviation = _standard_deviations(finished, all_sh, training, poses, config)
+    seen = _views_that_show(finished, training, poses, config)
+    joints = _joints(kinds, poses, finished, confidence, deviation, seen, sum(len(s) for s in training))
+    return JointResult(finished, all_sh, joints)
+
+
+def _joint_step(adam: torch.optim.Adam, rate: float, progress: float) -> None:
+    for group in adam.param_groups:
+        group["lr"] = rate * 0.02**progress
+    adam.step()
+    adam.zero_grad(set_to_none=True)
+
+
+def _picture_loss(
+    g: Gaussians, sh: Tensor, poses: JointPoses, view: TrainingView, state: int, config: JointsConfig
+) -> Tensor:
+    R, t = poses.Rt()
+    r = draw_state(g, R[state], t[state], view.camera, sh_offset=sh[state], background=torch.ones(3))
+    return photometric(four_planes(r), view.target, config.render.ssim_weight)
+
+
+def _choose_types(
+    g: Gaussians,
+    sh: Tensor,
+    training: Sequence[Sequence[TrainingView]],
+    poses_of,
+    n_joints: int,
+    config: JointsConfig,
+    rng: np.random.Generator,
+) -> tuple[list[JointType], np.ndarray]:
+    """Type of every joint and how sure it is, from photographs: which one-degree motion draws them better.
+
+    A slide is the simpler model, so a rotation must win significantly over the views. All joints are tried at once with
+    one type and then the other; only a joint whose verdict is close depends on its neighbours' types.
+    """
+    losses = {}
+    for kind in ("prismatic", "revolute"):
+        poses = poses_of([kind] * n_joints)
+        adam = torch.optim.Adam([poses.theta], lr=config.rate)
+        moved = [(s, i) for s in range(1, len(training)) for i in range(len(training[s]))]
+        order: list[tuple[int, int]] = []
+        for step in range(config.type_steps):
+            if not order:
+                order = [moved[j] for j in rng.permutation(len(moved))]
+            s, i = order.pop()
+            _picture_loss(g, sh, poses, training[s][i], s, config).backward()
+            _joint_step(adam, config.rate, step / config.type_steps)
+        losses[kind] = _losses_by_part(g, sh, training, poses, n_joints)
+    kinds: list[JointType] = []
+    confidence = np.zeros(n_joints)
+    for j in range(n_joints):
+        difference = losses["prismatic"][:, j] - losses["revolute"][:, j]
+        difference = difference[np.isfinite(difference)]
+        error = difference.std() / math.sqrt(max(len(difference), 1)) + 1e-12
+        z = float(difference.mean() / error) if len(difference) else 0.0
+        kinds.append("revolute" if z > config.type_significance else "prismatic")
+        # An even verdict between nested models speaks for the slide.
+        certainty = z - config.type_significance if kinds[-1] == "revolute" else config.type_significance - z
+        confidence[j] = 0.5 * (1 + math.erf(certainty / math.sqrt(2)))
+    return kinds, confidence
+
+
+@torch.no_grad()
+def _losses_by_part(
+    g: Gaussians, sh: Tensor, training: Sequence[Sequence[TrainingView]], poses: JointPoses, n_joints: int
+) -> np.ndarray:
+    """(views, joints) mean absolute error of each moved photograph over the pixels near each part; NaN where unseen."""
+    membership = torch.nn.functional.one_hot(g.part, n_joints + 1).float()[:, 1:]
+    R, t = poses.Rt()
+    rows = []
+    for s in range(1, len(training)):
+        for view in training[s]:
+            r = draw_state(
+                g, R[s], t[s], view.camera, sh_offset=sh[s], background=torch.ones(3), channels=membership
+            )
+            error = (four_planes(r) - view.image).abs().mean(0)
+            region = torch.nn.functional.max_pool2d(r.channels[None], 15, 1, 7)[0] > 0.3
+            area = region.flatten(1).sum(1)
+            mean = (error * region).flatten(1).sum(1) / area.clamp_min(1)
+            rows.append(torch.where(area > 30, mean, torch.nan).numpy())
+    return np.stack(rows)
+
+
+def _standard_deviations(
+    g: Gaussians, sh: Tensor, training: Sequence[Sequence[TrainingView]], poses: JointPoses, config: JointsConfig
+) -> np.ndarray | None:
+    """(joints, 4 + states − 1) standard deviation of ``theta``: the sandwich H⁻¹ (Σ g gᵀ) H⁻¹ over photographs.
+
+    H is the curvature of the summed photometric loss (finite differences of its gradient, joints independent of each
+    other); g are single photographs' gradients, whose scatter tells how far they disagree.
+    """
+    if config.uncertainty_views == 0:
+        return None
+    chosen = [
+        (s, i)
+        for s in range(1, len(training))
+        for i in np.linspace(0, len(training[s]) - 1, min(config.uncertainty_views, len(training[s]))).astype(int)
+    ]
+
+    def gradients() -> np.ndarray:
+        rows = []
+        for s, i in chosen:
+            (grad,) = torch.autograd.grad(_picture_loss(g, sh, poses, training[s][i], s, config), poses.theta)
+            rows.append(grad.double().numpy())
+        return np.stack(rows)
+
+    n_views = sum(len(state) for state in training[1:])
+    at = gradients()
+    size = poses.theta.shape[1]
+    H = np.zeros((poses.theta.shape[0], size, size))
+    step = 2e-3
+    for k in range(size):
+        for sign in (1, -1):
+            with torch.no_grad():
+                poses.theta[:, k] += sign * step
+            H[:, k] += sign * gradients().sum(0) / (2 * step)
+            with torch.no_grad():
+                poses.theta[:, k] -= sign * step
+    deviation = np.zeros(poses.theta.shape)
+    for j in range(len(H)):
+        symmetric = (H[j] + H[j].T) / 2
+        value, vector = np.linalg.eigh(symmetric)
+        # Directions the photographs do not feel (a slide's pivot) get no say.
+        keep = value > 1e-3 * value.max()
+        inverse = (vector[:, keep] / value[keep]) @ vector[:, keep].T
+        scatter = np.einsum("vi,vj->ij", at[:, j], at[:, j])
+        covariance = inverse @ scatter @ inverse * len(chosen) / n_views
+        deviation[j] = np.sqrt(np.maximum(np.diag(covariance), 0))
+    return deviation
+
+
+@torch.no_grad()
+def _views_that_show(
+    g: Gaussians, training: Sequence[Sequence[TrainingView]], poses: JointPoses, config: JointsConfig
+) -> np.ndarray:
+    """(joints,) number of photographs in which a part covers at least 30 pixels."""
+    membership = torch.nn.functional.one_hot(g.part, len(poses.axis0) + 1).float()[:, 1:]
+    R, t = poses.Rt()
+    count = np.zeros(len(poses.axis0), int)
+    for s, state in enumerate(training):
+        for view in state:
+            r = draw_state(g, R[s], t[s], view.camera, channels=membership)
+            count += ((r.channels > 0.5).flatten(1).sum(1) >= 30).numpy()
+    return count
+
+
+def _joints(
+    kinds: Sequence[JointType],
+    poses: JointPoses,
+    g: Gaussians,
+    confidence: np.ndarray,
+    deviation: np.ndarray | None,
+    seen: np.ndarray,
+    n_views: int,
+) -> tuple[Joint, ...]:
+    axes, pivots = (x.detach().double().numpy() for x in (poses.axis(), poses.pivot()))
+    values = poses.values().detach().double().numpy()
+    centroids = part_centres(g, len(kinds) + 1).double().numpy()[1:]
+    joints = []
+    for j, kind in enumerate(kinds):
+        axis, states = axes[j] / np.linalg.norm(axes[j]), values[:, j]
+        if states[np.abs(states).argmax()] < 0:
+            axis, states = -axis, -states
+        pivot = pivots[j] + axis * ((centroids[j] - pivots[j]) @ axis) if kind == "revolute" else centroids[j]
+        std, words = JointStd(), ""
+        if deviation is not None:
+            d = deviation[j]
+            axis_deg = math.degrees(math.hypot(d[0], d[1]))
+            motion = float(d[4:].max()) * float(poses.unit[j])
+            std = JointStd(axis_deg, math.hypot(d[2], d[3]) * poses.extent if kind == "revolute" else None, motion)
+            words = f"axis ±{axis_deg:.2g}°, "
+        joints.append(
+            Joint(
+                child=j + 1,
+                parent=0,
+                type=kind,
+                axis=(float(axis[0]), float(axis[1]), float(axis[2])),
+                pivot=(float(pivot[0]), float(pivot[1]), float(pivot[2])),
+                states=tuple(float(v) for v in states),
+                limits=(float(states.min()), float(states.max())),
+                std=std,
+                confidence=float(confidence[j]),
+                verdict=f"{words}seen in {seen[j]} of {n_views} views",
+            )
+        )
+    return tuple(joints)
+
+
+__all__ = ["JointPoses", "JointResult", "JointsConfig", "closest_joint", "find_joints"]
