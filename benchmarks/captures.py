@@ -42,9 +42,8 @@ def call(*args: str) -> str | None:
     """Run one command of the program in a process of its own; its last words if it fails."""
     command = [sys.executable, "-m", "hingesplat.cli", *args, "--quiet"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    return (
-        (done.stderr.strip() or f"exit code {done.returncode}").splitlines()[-1] if done.returncode else None
-    )
+    said = done.stderr.strip() or f"exit code {done.returncode}"
+    return said.splitlines()[-1] if done.returncode else None
 
 
 def results(run: Path) -> dict[str, Any]:

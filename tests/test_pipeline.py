@@ -167,7 +167,7 @@ def test_presets_differ_in_size_only() -> None:
     fast, standard, paper = preset("fast"), preset("standard"), preset("paper")
     assert standard == ReconstructConfig()
     assert fast.fit.steps < standard.fit.steps < paper.fit.steps == 30_000
-    assert paper.articulate.steps == 20_000
+    assert paper.articulate.steps == 25_000
     assert fast.segment == standard.segment == paper.segment
     with pytest.raises(HingesplatError, match="preset"):
         preset("quick")  # pyright: ignore[reportArgumentType]
@@ -229,6 +229,7 @@ def small_config() -> ReconstructConfig:
         config,
         fit=replace(config.fit, steps=500, start_gaussians=2000, max_gaussians=3500),
         articulate=replace(config.articulate, steps=300),
+        joints=replace(config.joints, steps=100, type_steps=30, uncertainty_views=4),
         mesh=replace(config.mesh, views=12, image_size=96, resolution=48),
     )
 

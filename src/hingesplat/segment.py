@@ -17,6 +17,8 @@ from scipy.spatial import cKDTree
 
 from hingesplat.capture import View
 from hingesplat.gaussians import SH_C0, Gaussians
+from hingesplat.register import Sheet, normals_of, register
+from hingesplat.screw import matrix_to_screw
 from hingesplat.search import Motion, ScoreVolume, scan, score_volume
 from hingesplat.visibility import COLOUR, FREE, HIDDEN, SURFACE, Sight, ask, look
 
@@ -58,9 +60,18 @@ class Surface:
     index: np.ndarray
     """(n,) rows of the state's Gaussians."""
     sight: Sight
+    normals: np.ndarray
+    """(n, 3)"""
 
     def rows(self, index: np.ndarray) -> "Surface":
-        return replace(self, points=self.points[index], colours=self.colours[index], index=self.index[index])
+        """The subset ``index``, seen by the same cameras."""
+        return Surface(
+            self.points[index], self.colours[index], self.index[index], self.sight, self.normals[index]
+        )
+
+    @property
+    def sheet(self) -> Sheet:
+        return Sheet(self.points, self.normals, self.colours)
 
 
 @dataclass(frozen=True)
@@ -92,7 +103,7 @@ def on_surface(gaussians: Gaussians, sight: Sight) -> Surface:
     views = answer[:, : HIDDEN + 1].sum(1)
     good = (answer[:, SURFACE] >= 2) & (answer[:, FREE] <= 0.15 * views) & (gaussians.opacities.numpy() > 0.2)
     index = np.flatnonzero(good)
-    return Surface(points[index], colours[index], index, sight)
+    return Surface(points[index], colours[index], index, sight, normals_of(gaussians)[index])
 
 
 def floating(answer: np.ndarray) -> np.ndarray:
@@ -387,7 +398,7 @@ def segment(
     owned: Labels = tuple(np.zeros(len(x.points), int) for x in surfaces)
     for round_ in range(config.rounds):
         chosen = [
-            _refit(m, own, surfaces, fine, 6.0 / 2**round_, config, rng)
+            _refit(m, own, surfaces, fine, extent, 6.0 / 2**round_, config, rng)
             for m, own in _owners(
                 chosen,
                 costs_of(chosen),
@@ -493,6 +504,7 @@ def _refit(
     own: tuple[np.ndarray, np.ndarray],
     surfaces: tuple[Surface, Surface],
     fine: Sequence[ScoreVolume],
+    extent: float,
     spread_deg: float,
     config: SegmentConfig,
     rng: np.random.Generator,
@@ -502,9 +514,28 @@ def _refit(
     if len(own[s]) < config.min_part_seeds:
         return motion
     chosen = rng.choice(own[s], min(2 * config.seeds_per_search, len(own[s])), replace=False)
-    p, c = surfaces[s].points[chosen], surfaces[s].colours[chosen]
-    refined = refine_motion(motion if s == 0 else inverted(motion), p, c, fine[1 - s], spread_deg)
-    return refined if s == 0 else inverted(refined)
+    mine, other = surfaces[s].rows(chosen), surfaces[1 - s]
+    start = motion if s == 0 else inverted(motion)
+    trials = [start, refine_motion(start, mine.points, mine.colours, fine[1 - s], spread_deg)]
+    trials += [registered(m, mine.sheet, other.sheet, extent) for m in trials]
+    costs = label_costs(mine, other.sight, trials, forward=True, hidden_cost=0.5)[:, 1:]
+    best = trials[int(costs.mean(0).argmin())]
+    return best if s == 0 else inverted(best)
+
+
+def registered(motion: Motion, source: Sheet, target: Sheet, extent: float) -> Motion:
+    """The motion after registration, of the same kind again: what another degree of freedom took up is dropped."""
+    T = register(source, target, motion.T, extent)
+    centroid = source.points.mean(0)
+    if motion.kind == "prismatic":
+        shift = T[:3, :3] @ centroid + T[:3, 3] - centroid
+        value = float(np.linalg.norm(shift)) or 1e-12
+        axis = shift / value
+        sign = 1.0 if axis @ motion.axis * motion.value >= 0 else -1.0
+        return replace(motion, axis=axis * sign, pivot=centroid, value=value * sign)
+    screw = matrix_to_screw(T, centroid)
+    sign = 1.0 if screw.axis @ motion.axis >= 0 else -1.0
+    return replace(motion, axis=screw.axis * sign, pivot=screw.pivot, value=screw.angle * sign)
 
 
 def spread_labels(points: np.ndarray, surface: Surface, labels: np.ndarray) -> np.ndarray:

@@ -1,0 +1,78 @@
+"""Trimmed point-to-plane registration: a motion that is roughly right made right to a fraction of a degree."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from hingesplat.gaussians import Gaussians
+from hingesplat.se3 import wxyz_to_matrix
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """Surface points with normals and colours, ready to be registered against."""
+
+    points: np.ndarray
+    """(n, 3)"""
+    normals: np.ndarray
+    """(n, 3) unit, either side."""
+    colours: np.ndarray
+    """(n, 3)"""
+
+    def features(self, colour_length: float) -> np.ndarray:
+        """(n, 6) position, and colour in scene units: a difference of 1 counts as ``colour_length``."""
+        return np.concatenate([self.points, self.colours * colour_length], 1)
+
+
+def normals_of(gaussians: Gaussians) -> np.ndarray:
+    """(n, 3) thinnest axis of each Gaussian: on a surface, its normal."""
+    R = wxyz_to_matrix(gaussians.quats.double()).numpy()
+    thin = gaussians.log_scales.numpy().argmin(1)
+    return R[np.arange(len(thin)), :, thin]
+
+
+def register(
+    source: Sheet,
+    target: Sheet,
+    T: np.ndarray,
+    extent: float,
+    *,
+    iterations: int = 15,
+    start_radius: float = 0.04,
+    end_radius: float = 0.012,
+    colour_length: float = 0.08,
+) -> np.ndarray:
+    """Refine T (4×4, source to target) by point-to-plane distance over pairs alike in place and colour.
+
+    A light pull along the tangent keeps texture in place where planes slide on themselves. Pairs farther apart than the
+    shrinking radius (fractions of the extent) are left out; directions that no pair constrains stay as they are.
+    """
+    tree = cKDTree(target.features(colour_length * extent))
+    for i in range(iterations):
+        radius = extent * start_radius * (end_radius / start_radius) ** (i / max(iterations - 1, 1))
+        moved = source.points @ T[:3, :3].T + T[:3, 3]
+        # Colours shift with the light: compare them less their median difference over the pairs.
+        query = np.concatenate([moved, source.colours * colour_length * extent], 1)
+        distance, index = tree.query(query)
+        near = distance < radius
+        if near.sum() < 12:
+            return T
+        p, q, n = moved[near], target.points[index[near]], target.normals[index[near]]
+        centre = p.mean(0)
+        arm = p - centre
+        rows, residuals = [], []
+        for direction, weight in ((n, 1.0), *((np.broadcast_to(e, p.shape), 0.1) for e in np.eye(3))):
+            rows.append(weight * np.concatenate([np.cross(arm, direction), direction], 1))
+            residuals.append(weight * ((q - p) * direction).sum(1))
+        A, b = np.concatenate(rows), np.concatenate(residuals)
+        robust = 1 / (1 + (np.abs(b) / (0.3 * radius)) ** 2)
+        H = A.T @ (A * robust[:, None])
+        damping = 1e-4 * np.diag(H).max() * np.eye(6)
+        step = np.linalg.solve(H + damping, A.T @ (robust * b))
+        delta = np.eye(4)
+        delta[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix()
+        delta[:3, 3] = centre + step[3:] - delta[:3, :3] @ centre
+        T = delta @ T
+    return T
