@@ -87,9 +87,7 @@ def main() -> None:
     torch.set_num_threads(1)
     rows, ratios = {}, {}
     n, side = SMALL
-    small = cpu_times(
-        {"numba": rasterising(n, side, "numba"), "torch": rasterising(n, side, "torch")}, repeats=7
-    )
+    small = cpu_times({"numba": rasterising(n, side, "numba"), "torch": rasterising(n, side, "torch")}, repeats=7)
     ratios["torch / numba"] = round(sum(small["torch"]) / sum(small["numba"]), 1)
     rows |= {f"{b}, {n} Gaussians, {side}×{side}": t for b, t in small.items()}
     sizes = {f"numba, {n} Gaussians, {side}×{side}": rasterising(n, side, "numba") for n, side in SCENES}

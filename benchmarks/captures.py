@@ -65,9 +65,7 @@ def measure_all(options: Options, console: Console) -> list[dict[str, Any]]:
     chosen = [p for p in folders if not options.names or p.name in options.names]
     lost = set(options.names) - {p.name for p in chosen}
     if lost or not chosen:
-        raise SystemExit(
-            f"{options.captures}: no capture with a truth named {', '.join(sorted(lost)) or '(any)'}"
-        )
+        raise SystemExit(f"{options.captures}: no capture with a truth named {', '.join(sorted(lost)) or '(any)'}")
     runs = options.runs or Path(tempfile.mkdtemp(prefix="hingesplat-bench-"))
     runs.mkdir(parents=True, exist_ok=True)
     rows = []

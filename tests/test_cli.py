@@ -142,13 +142,11 @@ def run_toy(capture: Path, out: Path, *options: str) -> int:
     return cli.main(["reconstruct", str(capture), "--out", str(out), *options])
 
 
-def test_joints_and_paths_are_shown_at_the_end(
-    stage, capture: Path, tmp_path: Path, monkeypatch, capfd
-) -> None:
+def test_joints_and_paths_are_shown_at_the_end(stage, capture: Path, tmp_path: Path, monkeypatch, capfd) -> None:
     monkeypatch.setenv("COLUMNS", "160")
     assert run_toy(capture, tmp_path / "run") == 0
     out, err = capfd.readouterr()
-    for text in ("part_1", "revolute", "(0.000, 0.000, 1.000)", "0.0° … 57.3°", "0.93", "twin.json"):
+    for text in ("part_1", "revolute", "0.000 0.000 1.000", "0.0° … 57.3°", "0.93", "twin.json"):
         assert text in out, text
     assert err == ""
     assert run_toy(capture, tmp_path / "run", "--quiet") == 0
@@ -229,9 +227,7 @@ def test_options_of_stages_start_from_the_preset() -> None:
     assert isinstance(plain, cli.Reconstruct) and plain.config == ReconstructConfig()
 
 
-@pytest.mark.parametrize(
-    "args", [["reconstruct"], ["nonsense"], ["synth", "cabinet"], ["reconstruct", "x", "--bad"]]
-)
+@pytest.mark.parametrize("args", [["reconstruct"], ["nonsense"], ["synth", "cabinet"], ["reconstruct", "x", "--bad"]])
 def test_wrong_options_exit_with_2(args: list[str], capfd) -> None:
     assert cli.main(args) == 2
     assert "Traceback" not in capfd.readouterr().err

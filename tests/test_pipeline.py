@@ -64,9 +64,7 @@ class Toy:
 
     def third(self, run: Run) -> None:
         self.calls.append("third")
-        Twin((Part(0, "base", len(Gaussians.load(run / "gaussians.safetensors"))),), ()).save(
-            run / "twin.json"
-        )
+        Twin((Part(0, "base", len(Gaussians.load(run / "gaussians.safetensors"))),), ()).save(run / "twin.json")
 
 
 @pytest.fixture
@@ -77,9 +75,7 @@ def toy(monkeypatch: pytest.MonkeyPatch) -> Toy:
     return toy
 
 
-def test_a_stopped_run_goes_on_after_its_last_finished_stage(
-    toy: Toy, capture: Capture, tmp_path: Path
-) -> None:
+def test_a_stopped_run_goes_on_after_its_last_finished_stage(toy: Toy, capture: Capture, tmp_path: Path) -> None:
     toy.error = KeyboardInterrupt()
     with pytest.raises(KeyboardInterrupt):
         reconstruct(capture, out=tmp_path / "run")
@@ -134,9 +130,7 @@ def test_a_run_is_bound_to_its_capture_and_config(toy: Toy, capture: Capture, tm
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_a_folder_that_is_no_run_is_left_alone(
-    toy: Toy, capture: Capture, tmp_path: Path, overwrite: bool
-) -> None:
+def test_a_folder_that_is_no_run_is_left_alone(toy: Toy, capture: Capture, tmp_path: Path, overwrite: bool) -> None:
     (tmp_path / "precious.txt").write_text("mine")
     with pytest.raises(HingesplatError, match="holds no run"):
         reconstruct(capture, out=tmp_path, overwrite=overwrite)
@@ -149,9 +143,7 @@ def test_a_folder_that_is_no_run_is_left_alone(
 
 def test_max_size_caps_the_photographs(toy: Toy, capture: Capture, monkeypatch, tmp_path: Path) -> None:
     seen = []
-    monkeypatch.setitem(
-        pipeline.STAGES, "second", lambda run: seen.extend(v.camera.width for v in run.views[0])
-    )
+    monkeypatch.setitem(pipeline.STAGES, "second", lambda run: seen.extend(v.camera.width for v in run.views[0]))
     reconstruct(capture, replace(ReconstructConfig(), max_size=40), out=tmp_path / "run")
     assert set(seen) == {40}
 
@@ -195,9 +187,7 @@ MOTION = Motion("prismatic", np.array([0.0, 0, 1]), np.zeros(3), 0.1, 0.9)
         ((MOTION,), 0.1, 10, "moves"),
     ],
 )
-def test_motion_that_is_none_or_not_rigid(
-    capture, tmp_path, caplog, motions, unexplained, seeds, outcome
-) -> None:
+def test_motion_that_is_none_or_not_rigid(capture, tmp_path, caplog, motions, unexplained, seeds, outcome) -> None:
     run = Run(tmp_path, capture, ReconstructConfig(), lambda **_: None)
     nothing = np.zeros(0, int)
     found = Segmentation((nothing, nothing), motions, unexplained, seeds)

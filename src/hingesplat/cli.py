@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TextColumn
@@ -57,9 +58,7 @@ class Reconstruct:
         from hingesplat.capture import load_capture
 
         config = self.config
-        capture = load_capture(
-            self.capture, max_size=config.max_size, masks=self.masks, with_depth=config.depth
-        )
+        capture = load_capture(self.capture, max_size=config.max_size, masks=self.masks, with_depth=config.depth)
         twin = _reconstruct(capture, config, self.out, self.overwrite, console)
         show_joints(console, twin)
         show_paths(console, self.out)
@@ -81,21 +80,29 @@ class Demo:
     def run(self, console: Console) -> None:
         from hingesplat.capture import load_capture
         from hingesplat.metrics import evaluate
-        from hingesplat.pipeline import ReconstructConfig
 
         started = time.perf_counter()
         capture, run = self.out / "capture", self.out / "run"
         if not (capture / "truth" / "meta.json").is_file():
             Synth("cabinet", capture, size=200, views=50).run(console)
-        config = ReconstructConfig()
-        config = replace(
-            config, fit=replace(config.fit, steps=1200, start_gaussians=3000, max_gaussians=8000)
-        )
-        twin = _reconstruct(load_capture(capture), config, run, True, console)
+        twin = _reconstruct(load_capture(capture), demo_config(), run, True, console)
         show_joints(console, twin)
         show_metrics(console, evaluate(run, capture / "truth"))
         show_paths(console, run)
         console.print(f"{time.perf_counter() - started:.0f} s in all")
+
+
+def demo_config() -> "ReconstructConfig":
+    """The standard preset cut to the demo's 200 pixels."""
+    from hingesplat.pipeline import ReconstructConfig
+
+    config = ReconstructConfig()
+    return replace(
+        config,
+        fit=replace(config.fit, steps=1200, start_gaussians=3000, max_gaussians=8000),
+        articulate=replace(config.articulate, steps=1000, max_gaussians=9000),
+        mesh=replace(config.mesh, views=32, image_size=200),
+    )
 
 
 @dataclass(frozen=True)
@@ -273,9 +280,7 @@ class StageProgress:
     def __exit__(self, *_: object) -> None:
         self.progress.stop()
 
-    def report(
-        self, *, stage: str, state: int | None = None, seconds: float | None = None, **numbers: Any
-    ) -> None:
+    def report(self, *, stage: str, state: int | None = None, seconds: float | None = None, **numbers: Any) -> None:
         label = stage if state is None else f"{stage} state {state}"
         if seconds is not None:
             for name, task in self.tasks.items():
@@ -283,9 +288,7 @@ class StageProgress:
                     self._finish(task)
             return
         if label not in self.tasks:
-            if (
-                state is not None and stage in self.tasks
-            ):  # A stage's first state takes the line of the stage.
+            if state is not None and stage in self.tasks:  # A stage's first state takes the line of the stage.
                 self.tasks[label] = self.tasks.pop(stage)
                 self.progress.update(self.tasks[label], description=label)
             else:
@@ -321,38 +324,31 @@ def show_joints(console: Console, twin: "Twin") -> None:
     if not twin.joints:
         console.print("No joints: the twin is static.")
         return
-    table = Table(
-        "part", "parent", "type", "axis", "pivot", "range", "confidence", "verdict", title="Joints found"
-    )
     names = {part.id: part.name for part in twin.parts}
+    table = Table("part", "type", "axis", "pivot", "range", "conf.", title="Joints found", box=SIMPLE_HEAD)
     for j in twin.joints:
         turns = j.type == "revolute"
         low, high = (degrees(v) if turns else v for v in j.limits)
-        spread = j.std.motion if j.std.motion is None or not turns else degrees(j.std.motion)
-        motion = f"{low:.1f}° … {high:.1f}°" if turns else f"{low:.3f} … {high:.3f}"
-        if spread is not None:
-            motion += f" ± {spread:.2f}°" if turns else f" ± {spread:.4f}"
-        tilt = "" if j.std.axis_deg is None else f" ± {j.std.axis_deg:.2f}°"
         table.add_row(
-            names.get(j.child, str(j.child)),
-            names.get(j.parent, str(j.parent)),
+            names[j.child] + (f" on {names[j.parent]}" if j.parent else ""),
             j.type,
-            _vector(j.axis) + tilt,
-            _vector(j.pivot) if turns else "",
-            motion,
+            _vector(j.axis, 3),
+            _vector(j.pivot, 2) if turns else "",
+            f"{low:.1f}° … {high:.1f}°" if turns else f"{low:.3f} … {high:.3f}",
             "" if j.confidence is None else f"{j.confidence:.2f}",
-            escape(j.verdict),
         )
     console.print(table)
+    for j in twin.joints:
+        if j.verdict:
+            console.print(f"{names[j.child]}: {escape(j.verdict)}", soft_wrap=True)
 
 
 def show_metrics(console: Console, metrics: dict[str, Any]) -> None:
     """The tables of an evaluation: joints, then surfaces and pictures."""
-    table = Table(
-        "truth", "part", "type", "axis °", "position ×10", "pivot", "motion", "CD", title="Beside the truth"
-    )
+    titles = ("truth", "part", "type", "axis °", "pos. ×10", "pivot", "motion", "CD")
+    table = Table(*titles, title="Beside the truth", box=SIMPLE_HEAD)
     for joint, cd in zip(metrics["joints"], metrics["cd"]["movable"], strict=True):
-        motion = [_number(joint["motion_deg"], 3, "°"), _number(joint["motion_units"], 4, " units")]
+        motion = [_number(joint["motion_deg"], 3, "°"), _number(joint["motion_units"], 4)]
         found = "missed" if joint["part"] is None else str(joint["part"])
         kind = joint["type_true"]
         table.add_row(
@@ -369,7 +365,7 @@ def show_metrics(console: Console, metrics: dict[str, Any]) -> None:
     views, depth = metrics["views"], metrics["penetration"]["depth"]
     numbers = {
         "parts": f"{metrics['parts_found']} of {metrics['parts_true']}",
-        "superfluous": str(metrics["superfluous_parts"]),
+        "extra": str(metrics["superfluous_parts"]),
         "CD static": _number(metrics["cd"]["static"], 2),
         "CD whole": _number(metrics["cd"]["whole"], 2),
         "penetration": _number(depth, 4),
@@ -377,7 +373,7 @@ def show_metrics(console: Console, metrics: dict[str, Any]) -> None:
         "SSIM": _number(views["ssim"], 4),
         "part IoU": _number(metrics["part_iou"], 3),
     }
-    rest = Table(*numbers)
+    rest = Table(*numbers, box=SIMPLE_HEAD)
     rest.add_row(*numbers.values())
     console.print(rest)
     if views.get("why_null"):
@@ -405,8 +401,8 @@ def _number(value: float | None, digits: int, unit: str = "") -> str:
     return "" if value is None else f"{value:.{digits}f}{unit}"
 
 
-def _vector(v: Sequence[float]) -> str:
-    return "(" + ", ".join(f"{x + 0.0:.3f}" for x in v) + ")"
+def _vector(v: Sequence[float], digits: int) -> str:
+    return " ".join(f"{round(x, digits) + 0.0:.{digits}f}" for x in v)
 
 
 class _ConsoleHandler(logging.Handler):

@@ -83,9 +83,10 @@ class ReconstructConfig:
 def preset(name: PresetName) -> ReconstructConfig:
     """``standard``: the defaults. ``fast``: about half the steps. ``paper``: its iterations and sizes.
 
-    The paper fits for 30 000 iterations and fuses for 5 000 (Part²GS, supplementary); of its joint optimisation
-    it gives no number, so that is the 20 000 of ArtGS. What it calls fusion, photographs of both states and one
-    set of Gaussians, our ``articulate`` does, so it gets both. Caps are out of the way: 3DGS knows none.
+    The paper fits for 30 000 iterations and fuses for 5 000 (Part²GS, supplementary); for its joint
+    optimisation it gives no number, so that is the 20 000 of ArtGS. What it calls fusion, photographs of both
+    states and one set of Gaussians, our ``articulate`` does, so it gets both. Caps are out of the way: 3DGS
+    knows none.
     """
     config = ReconstructConfig(preset=name)
     match name:
@@ -102,9 +103,7 @@ def preset(name: PresetName) -> ReconstructConfig:
         case "paper":
             return replace(
                 config,
-                fit=replace(
-                    config.fit, steps=30_000, start_gaussians=50_000, max_gaussians=500_000, max_sh_degree=3
-                ),
+                fit=replace(config.fit, steps=30_000, start_gaussians=50_000, max_gaussians=500_000, max_sh_degree=3),
                 articulate=replace(config.articulate, steps=25_000, max_gaussians=500_000),
                 mesh=replace(config.mesh, views=100, image_size=400, resolution=256),
             )
@@ -209,9 +208,7 @@ def _segment(run: Run) -> None:
     last = len(run.capture.states) - 1
     pair = (_fitted(run, 0), _fitted(run, last))
     parts = None if run.config.parts == "auto" else run.config.parts - 1
-    found = segment(
-        pair, (run.views[0], run.views[last]), run.config.segment, parts=parts, seed=run.config.seed
-    )
+    found = segment(pair, (run.views[0], run.views[last]), run.config.segment, parts=parts, seed=run.config.seed)
     _check_explained(run, found, last)
     write_tensors(
         run / "segmentation.safetensors",
@@ -270,9 +267,7 @@ def _joints(run: Run) -> None:
     joints: tuple[Joint, ...] = ()
     if T_state_0.shape[1] > 1:
         config, report = run.config.joints, run.reporting("joints")
-        found = find_joints(
-            gaussians, T_state_0, state_sh, run.views, config, seed=run.config.seed, report=report
-        )
+        found = find_joints(gaussians, T_state_0, state_sh, run.views, config, seed=run.config.seed, report=report)
         gaussians, state_sh, joints = found.gaussians, found.state_sh, found.joints
     gaussians = gaussians.detached()
     ids = [0, *sorted(j.child for j in joints)]
@@ -343,9 +338,7 @@ def _result(run: Run) -> tuple[Gaussians, Twin]:
 
 def _check(config: ReconstructConfig) -> None:
     if config.parts != "auto" and config.parts < 2:
-        raise HingesplatError(
-            f"parts: must be auto, or at least 2 (the base and a mover), not {config.parts}"
-        )
+        raise HingesplatError(f"parts: must be auto, or at least 2 (the base and a mover), not {config.parts}")
     if config.max_size is not None and config.max_size < 1:
         raise HingesplatError(f"max_size: must be at least 1 pixel, not {config.max_size}")
 
@@ -473,8 +466,7 @@ def _check_same_run(folder: Path, known: dict[str, Any], wanted: dict[str, Any])
         )
     if known["photographs"] != wanted["photographs"]:
         raise HingesplatError(
-            f"{folder}: belongs to another capture (the photographs in {known['capture']} have changed); "
-            f"{remedy}"
+            f"{folder}: belongs to another capture (the photographs in {known['capture']} have changed); {remedy}"
         )
 
 

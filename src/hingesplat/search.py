@@ -89,7 +89,7 @@ def _sum(
     nx, ny, nz = score.shape
     m = q.shape[0]
     zero = np.float32(0)
-    penalty, welcome, square = zero, zero, zero
+    penalty, welcome, square, unseen = zero, zero, zero, zero
     mean0, mean1, mean2 = zero, zero, zero
     for i in range(m):
         x = int((q[i, 0] + shift[0] - origin[0]) * inverse_voxel + np.float32(0.5))
@@ -100,7 +100,7 @@ def _sum(
         else:
             s = score[x, y, z]
             if s == HIDDEN32:
-                penalty += s
+                unseen += s
             elif s > 0:
                 e0 = volume_colour[x, y, z, 0] - colours[i, 0]
                 e1 = volume_colour[x, y, z, 1] - colours[i, 1]
@@ -112,13 +112,14 @@ def _sum(
                 square += s * (e0 * e0 + e1 * e1 + e2 * e2)
             else:
                 penalty += s
-        if i == m // 4 and welcome + penalty < give_up * i:
+        if i == m // 4 and welcome + unseen + penalty < give_up * i:
             return np.float32(-1)
     if welcome > 0:
         offset = (mean0 * mean0 + mean1 * mean1 + mean2 * mean2) / welcome
         variance = (square - np.float32(0.8) * offset) / welcome
         welcome /= np.float32(1) + variance * np.float32(1 / COLOUR_SCALE**2)
-    return (welcome + penalty) / m
+    # What is hidden counts as far as something is seen: else every part would vanish inside another.
+    return (welcome + min(unseen, welcome) + penalty) / m
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

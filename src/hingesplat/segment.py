@@ -23,6 +23,10 @@ from hingesplat.search import Motion, ScoreVolume, scan, score_volume
 from hingesplat.visibility import COLOUR, FREE, HIDDEN, SURFACE, Sight, ask, look
 
 
+HIDDEN_SEED_COST = 0.5
+"""Cost of a seed that a motion takes out of everybody's sight."""
+
+
 @dataclass(frozen=True)
 class SegmentConfig:
     """Finding the parts and their first motions."""
@@ -31,14 +35,18 @@ class SegmentConfig:
     """Longest side in pixels of the depth pictures that judge the hypotheses."""
     tolerance: float = 0.012
     """Half-width of a surface, as a fraction of the object's extent."""
-    cells: int = 56
+    cells: int = 48
     """Voxels along the object's longest side in the coarse search."""
-    seeds_per_search: int = 160
+    seeds_per_search: int = 128
     """Seeds moved in one search."""
     max_seeds: int = 1200
     """Seeds of each state that judge the hypotheses."""
     explained_cost: float = 0.8
     """A seed that a motion explains worse than this counts as unexplained."""
+    consensus_cost: float = 0.45
+    """A seed agrees with a motion that costs it less than this."""
+    consensus_motions: int = 30
+    """Hypotheses that are refined on all seeds that agree with them."""
     part_cost: float = 10.0
     """Description length of one more part, in seeds (a seed stands for 0.012² of the extent's square)."""
     min_part_seeds: int = 25
@@ -68,6 +76,11 @@ class Surface:
         return Surface(
             self.points[index], self.colours[index], self.index[index], self.sight, self.normals[index]
         )
+
+    def blurred(self, k: int = 8) -> np.ndarray:
+        """(n, 3) mean colour of each point and its neighbours: what a coarse voxel would show."""
+        index = cKDTree(self.points).query(self.points, min(k, len(self.points)))[1]
+        return self.colours[index].mean(1)
 
     @property
     def sheet(self) -> Sheet:
@@ -176,7 +189,10 @@ def select_motions(costs: np.ndarray, config: SegmentConfig, parts: int | None) 
     price = config.part_cost
     limit = parts if parts is not None else config.max_parts
     while len(chosen) < limit:
-        gain = np.maximum(unexplained[:, None] - costs, 0).sum(0)
+        gain = np.maximum(unexplained[:, None] - costs, 0)
+        # Seeds that merely vanish count as far as others are seen to arrive.
+        seen = np.where(costs < HIDDEN_SEED_COST, gain, 0).sum(0)
+        gain = seen + np.minimum(gain.sum(0) - seen, seen)
         best = int(gain.argmax())
         if gain[best] <= (0 if parts is not None else price):
             break
@@ -238,6 +254,11 @@ def label_costs(
             + (0.0 if motion is None else 0.1 + 0.1 * travel)
         )
     return np.stack(columns, 1)
+
+
+def seed_costs(seeds: Surface, other: Sight, motions: Sequence[Motion], *, forward: bool) -> np.ndarray:
+    """(n, motions) cost of each motion for each seed. Here hidden is worse than seen: a seed must go somewhere."""
+    return label_costs(seeds, other, motions, forward=forward, hidden_cost=HIDDEN_SEED_COST)[:, 1:]
 
 
 def neighbour_weights(points: np.ndarray, colours: np.ndarray, radius: float, k: int = 12) -> csr_matrix:
@@ -389,11 +410,12 @@ def segment(
     def costs_of(candidates: Sequence[Motion]) -> np.ndarray:
         """(seeds, candidates) what the other state's cameras say of every seed under every candidate."""
         pairs = ((judges[0], sights[1], True), (judges[1], sights[0], False))
-        return np.concatenate(
-            [label_costs(j, o, candidates, forward=f, hidden_cost=0.5)[:, 1:] for j, o, f in pairs]
-        )
+        return np.concatenate([seed_costs(j, o, candidates, forward=f) for j, o, f in pairs])
 
-    chosen = [pool[k] for k in select_motions(costs_of(pool), config, parts)]
+    costs = costs_of(pool)
+    pool += consensus(pool, costs, surfaces, [i[: config.max_seeds] for i in seeds], fine, extent, config, rng)
+    costs = np.concatenate([costs, costs_of(pool[costs.shape[1] :])], 1)
+    chosen = [pool[k] for k in select_motions(costs, config, parts)]
     problem = Labelling.of(surfaces, extent)
     owned: Labels = tuple(np.zeros(len(x.points), int) for x in surfaces)
     for round_ in range(config.rounds):
@@ -484,19 +506,53 @@ def propose(
         return []
     directions = axis_directions([surfaces[s].points[g] for s, g in groups])
     pool = []
+    blurred = [surface.blurred() for surface in surfaces]
     for s, group in groups:
         chosen = rng.choice(group, min(config.seeds_per_search, len(group)), replace=False)
         p, c = surfaces[s].points[chosen], surfaces[s].colours[chosen]
         # Slides get a hearing of their own: with three numbers fewer they are seldom the luckiest fit.
         for kind in ("revolute", "prismatic"):
-            found = scan(p, c, directions, coarse[1 - s], kinds=(kind,), keep=3)
+            found = scan(p, blurred[s][chosen], directions, coarse[1 - s], kinds=(kind,), keep=4)
             for motion in found:
                 if motion.score > max(0.1, 0.7 * found[0].score):
                     # Compare hypotheses at their best: on the grid a true one may be 3° off and lose to a lucky one.
                     for spread in (4.0, 1.5):
                         motion = refine_motion(motion, p, c, fine[1 - s], spread)
+                    motion = polished([motion], surfaces[s].rows(chosen), surfaces[1 - s], extent)
                     pool.append(motion if s == 0 else inverted(motion))
     return pool
+
+
+def consensus(
+    pool: Sequence[Motion],
+    costs: np.ndarray,
+    surfaces: tuple[Surface, Surface],
+    seeds: Sequence[np.ndarray],
+    fine: Sequence[ScoreVolume],
+    extent: float,
+    config: SegmentConfig,
+    rng: np.random.Generator,
+) -> list[Motion]:
+    """The most promising hypotheses, each refined on all seeds that agree with it wherever they are.
+
+    A hypothesis comes from one patch; the right one fits the whole part, and grows better with it.
+    """
+    gain = np.maximum(config.explained_cost - costs, 0) * (costs < HIDDEN_SEED_COST)
+    gain = gain.sum(0)
+    sample = surfaces[0].points[seeds[0][:100]] if len(seeds[0]) else surfaces[1].points[seeds[1][:100]]
+    refined: list[Motion] = []
+    ends: list[np.ndarray] = []
+    for k in np.argsort(-gain):
+        end = moved(sample, pool[k].T)
+        if any(np.linalg.norm(end - e, axis=1).mean() < 0.03 * extent for e in ends):
+            continue
+        ends.append(end)
+        motion, agree = pool[k], costs[:, k] < config.consensus_cost
+        own = (seeds[0][agree[: len(seeds[0])]], seeds[1][agree[len(seeds[0]) :]])
+        refined.append(_refit(motion, own, surfaces, fine, extent, 3.0, config, rng))
+        if len(refined) == config.consensus_motions:
+            break
+    return refined
 
 
 def _refit(
@@ -516,11 +572,15 @@ def _refit(
     chosen = rng.choice(own[s], min(2 * config.seeds_per_search, len(own[s])), replace=False)
     mine, other = surfaces[s].rows(chosen), surfaces[1 - s]
     start = motion if s == 0 else inverted(motion)
-    trials = [start, refine_motion(start, mine.points, mine.colours, fine[1 - s], spread_deg)]
-    trials += [registered(m, mine.sheet, other.sheet, extent) for m in trials]
-    costs = label_costs(mine, other.sight, trials, forward=True, hidden_cost=0.5)[:, 1:]
-    best = trials[int(costs.mean(0).argmin())]
-    return best if s == 0 else inverted(best)
+    fit = polished([start, refine_motion(start, mine.points, mine.colours, fine[1 - s], spread_deg)], mine, other, extent)
+    return fit if s == 0 else inverted(fit)
+
+
+def polished(trials: Sequence[Motion], mine: Surface, other: Surface, extent: float) -> Motion:
+    """The best of some motions and their registrations, as the other state's cameras judge them."""
+    everyone = [*trials, *(registered(m, mine.sheet, other.sheet, extent) for m in trials)]
+    costs = seed_costs(mine, other.sight, everyone, forward=True)
+    return everyone[int(costs.mean(0).argmin())]
 
 
 def registered(motion: Motion, source: Sheet, target: Sheet, extent: float) -> Motion:

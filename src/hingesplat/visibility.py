@@ -84,7 +84,7 @@ def _ask(points, colours, P, depth, rgb, tolerance, answer):  # pragma: no cover
             w = int(np.floor((p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]) / d))
             if u < 1 or w < 1 or u >= width - 1 or w >= height - 1:
                 continue
-            # The nearest of nine pixels decides, so that an edge one pixel off is no contradiction.
+            # The best of nine pixels decides, so that an edge or a speckle one pixel off is no contradiction.
             off = 0
             least = np.float32(1e9)
             signed = np.float32(0)
@@ -100,10 +100,14 @@ def _ask(points, colours, P, depth, rgb, tolerance, answer):  # pragma: no cover
                 free += 1
             elif least < tolerance:
                 surface += 1
-                e0 = rgb[v, w, u, 0] - colours[i, 0]
-                e1 = rgb[v, w, u, 1] - colours[i, 1]
-                e2 = rgb[v, w, u, 2] - colours[i, 2]
-                difference += np.sqrt(e0 * e0 + e1 * e1 + e2 * e2)
+                closest = np.float32(3)
+                for b in range(-1, 2):
+                    for a in range(-1, 2):
+                        e0 = rgb[v, w + b, u + a, 0] - colours[i, 0]
+                        e1 = rgb[v, w + b, u + a, 1] - colours[i, 1]
+                        e2 = rgb[v, w + b, u + a, 2] - colours[i, 2]
+                        closest = min(closest, e0 * e0 + e1 * e1 + e2 * e2)
+                difference += np.sqrt(closest)
             elif least < 1e8:
                 if signed < -tolerance:
                     free += 1
@@ -120,7 +124,7 @@ def ask(points: np.ndarray, colours: np.ndarray, sight: Sight) -> np.ndarray:
 
     Returns:
         (n, 4): the number of views in which the point is in free space, on the surface, hidden behind it; and the mean
-        Euclidean RGB difference over the views that see it on the surface.
+        Euclidean RGB difference (best of nine pixels) over the views that see it on the surface.
     """
     answer = np.empty((len(points), 4), np.float32)
     _ask(
