@@ -272,9 +272,7 @@ def colmap(root: Path, model: str, suffix: str, distortion: float = 0.0, in_imag
     c = next(iter(shots.values())).camera
     kind = (4, "OPENCV") if distortion else (1, "PINHOLE")
     params = [c.fx, c.fy, c.cx, c.cy] + ([distortion, 0.0, 0.0, 0.0] if distortion else [])
-    cameras = struct.pack("<QiiQQ", 1, 7, kind[0], c.width, c.height) + struct.pack(
-        f"<{len(params)}d", *params
-    )
+    cameras = struct.pack("<QiiQQ", 1, 7, kind[0], c.width, c.height) + struct.pack(f"<{len(params)}d", *params)
     text = ["# Image list with two lines of data per image"]
     images = struct.pack("<Q", len(shots))
     for i, (name, view) in enumerate(reversed(shots.items())):
@@ -418,10 +416,7 @@ def test_hull_survives_a_few_bad_masks_and_objects_cut_by_the_frame():
 
 
 def test_no_hull_is_an_error():
-    away = [
-        replace(v, camera=replace(v.camera, T_world_camera=v.camera.T_world_camera @ FLIP))
-        for v in views("end")
-    ]
+    away = [replace(v, camera=replace(v.camera, T_world_camera=v.camera.T_world_camera @ FLIP)) for v in views("end")]
     with pytest.raises(HingesplatError, match="no common visual hull"):
         visual_hull(away)
 
@@ -472,9 +467,7 @@ def test_each_mistaken_convention_is_named(tmp_path, mistake, n):
 
 
 def test_mistaken_colmap_poses_are_named():
-    wrong = [
-        replace(v, camera=replace(v.camera, T_world_camera=v.camera.T_camera_world)) for v in views("start")
-    ]
+    wrong = [replace(v, camera=replace(v.camera, T_world_camera=v.camera.T_camera_world)) for v in views("start")]
     state = State("start", tuple(wrong), ())
     with pytest.raises(HingesplatError, match="matrices are camera-to-world with OpenCV axes"):
         check_states([state, state], "colmap")
@@ -644,9 +637,7 @@ def test_identical_states_and_a_slightly_rounded_pose_are_accepted(tmp_path):
         write_state(tmp_path / name, views("start"), "train")
     edit(
         tmp_path / "end" / "transforms_train.json",
-        lambda d: [
-            f.update(transform_matrix=np.round(f["transform_matrix"], 4).tolist()) for f in d["frames"]
-        ],
+        lambda d: [f.update(transform_matrix=np.round(f["transform_matrix"], 4).tolist()) for f in d["frames"]],
     )
     R = load_capture(tmp_path).states[1].train[0].camera.T_world_camera[:3, :3]
     np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-12)

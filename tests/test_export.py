@@ -109,9 +109,7 @@ def test_link_frames_sit_at_the_pivots_and_inertia_is_a_boxs(cabinet, tmp_path: 
     inertia = link.find("inertial/inertia")
     assert float(inertia.get("izz")) == pytest.approx(mass / 12 * (a * a + b * b))
     assert float(inertia.get("ixx")) == pytest.approx(mass / 12 * (b * b + c * c))
-    assert [float(v) for v in link.find("inertial/origin").get("xyz").split()] == pytest.approx(
-        [0.6, -0.02, 0]
-    )
+    assert [float(v) for v in link.find("inertial/origin").get("xyz").split()] == pytest.approx([0.6, -0.02, 0])
     files = [m.get("filename") for m in root.iter("mesh")]
     assert files and all(not Path(f).is_absolute() and (tmp_path / f).is_file() for f in files)
     names = [e.get("name") for e in root.iter("link")]

@@ -53,9 +53,7 @@ def rigid(g: torch.Generator) -> Tensor:
 
 def test_part_probabilities_are_probabilities_with_gradients(g: torch.Generator) -> None:
     psi, weight, bias = leaf(randn(g, N, 4)), leaf(randn(g, K, 4)), leaf(randn(g, K))
-    torch.testing.assert_close(
-        part_probabilities(psi, weight, bias).sum(1), torch.ones(N, dtype=torch.float64)
-    )
+    torch.testing.assert_close(part_probabilities(psi, weight, bias).sum(1), torch.ones(N, dtype=torch.float64))
     assert gradcheck(part_probabilities, (psi, weight, bias))
 
 
@@ -238,9 +236,7 @@ def test_a_gaussian_is_pushed_away_from_a_repel_point(g: torch.Generator) -> Non
 
 def test_repulsion_lowers_penetration(g: torch.Generator) -> None:
     """Two solid balls overlap by a third of a diameter; the mean force, as eq. 13 adds it, parts them."""
-    base, part = (
-        sphere(g, 600) * torch.rand(600, 1, generator=g, dtype=torch.float64) ** (1 / 3) for _ in "ab"
-    )
+    base, part = (sphere(g, 600) * torch.rand(600, 1, generator=g, dtype=torch.float64) ** (1 / 3) for _ in "ab")
     part = part + torch.tensor([1.4, 0, 0], dtype=torch.float64)
 
     def penetration(mu: Tensor) -> float:
@@ -281,9 +277,7 @@ def test_the_force_turns_with_the_frame_and_the_nearest_points_carry_it(g: torch
     mu = sphere(g, 40, 1.01)
     A = rigid(g)
     near, whole = repel_force(mu, r, tau_max=1e9), repel_force(mu, r, tau_max=1e9, nearest=None)
-    torch.testing.assert_close(
-        repel_force(se3.apply(A, mu), se3.apply(A, r), tau_max=1e9), near @ A[:3, :3].T
-    )
+    torch.testing.assert_close(repel_force(se3.apply(A, mu), se3.apply(A, r), tau_max=1e9), near @ A[:3, :3].T)
     assert torch.cosine_similarity(near, whole).median() > 0.7
 
 

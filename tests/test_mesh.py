@@ -47,9 +47,7 @@ def traced(camera: Camera, mesh: trimesh.Trimesh) -> DepthView:
     """Exact depth of a mesh, all of it the part's own."""
     origin, rays = camera.rays()
     flat = rays.reshape(-1, 3)
-    points, index, _ = mesh.ray.intersects_location(
-        np.broadcast_to(origin, flat.shape), flat, multiple_hits=False
-    )
+    points, index, _ = mesh.ray.intersects_location(np.broadcast_to(origin, flat.shape), flat, multiple_hits=False)
     depth = np.full(len(flat), np.inf, np.float32)
     depth[index] = (points - origin) @ camera.T_world_camera[:3, 2]
     depth = depth.reshape(camera.height, camera.width)

@@ -93,9 +93,7 @@ def test_revolute_errors() -> None:
         np.degrees(1.0)
     )
     same = Joint(1, 0, "revolute", (0, 0, -1), (0, 0, 0), (0, -0.5), (-1, 0))
-    assert joint_errors(truth, same, same.transform(-0.5), np.ones(3))["motion_deg"] == pytest.approx(
-        0, abs=1e-9
-    )
+    assert joint_errors(truth, same, same.transform(-0.5), np.ones(3))["motion_deg"] == pytest.approx(0, abs=1e-9)
 
 
 def test_crossing_axes_have_no_line_distance_but_a_pivot_distance() -> None:
@@ -156,12 +154,8 @@ def test_samples_are_uniform_over_the_area_of_all_meshes() -> None:
 
 def test_cleaning_drops_small_islands_only() -> None:
     big, small, speck = (trimesh.creation.box([s] * 3) for s in (1.0, 0.5, 0.2))
-    mesh = trimesh.util.concatenate(
-        [big, small.apply_translation([3, 0, 0]), speck.apply_translation([6, 0, 0])]
-    )
-    loose = trimesh.Trimesh(
-        mesh.triangles.reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3), process=False
-    )
+    mesh = trimesh.util.concatenate([big, small.apply_translation([3, 0, 0]), speck.apply_translation([6, 0, 0])])
+    loose = trimesh.Trimesh(mesh.triangles.reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3), process=False)
     for m in (mesh, loose):  # The second shares no vertices: its triangles still belong together.
         assert clean(m).area == pytest.approx(6 + 1.5)
         assert clean(m).bounds[1, 0] < 4
@@ -214,9 +208,7 @@ def test_the_truth_itself_scores_nought(capture: Path, tmp_path: Path) -> None:
     for key in ("axis_deg", "position_x10", "pivot", "motion_deg"):
         assert door[key] == pytest.approx(0, abs=1e-6)
     assert drawer["motion_units"] == pytest.approx(0, abs=1e-9) and drawer["motion_deg"] is None
-    assert (
-        metrics["cd"]["whole"] < 0.5 and max(metrics["cd"]["movable"]) < 0.2 and metrics["cd"]["static"] < 0.4
-    )
+    assert metrics["cd"]["whole"] < 0.5 and max(metrics["cd"]["movable"]) < 0.2 and metrics["cd"]["static"] < 0.4
     assert metrics["penetration"]["volume_fraction"] < 0.005
     assert metrics["part_iou"] > 0.75
     assert metrics["views"]["psnr"] > 5 and 0 < metrics["views"]["ssim"] < 1
@@ -287,9 +279,7 @@ def chain(folder: Path) -> Path:
     """A slide on the base and a hinge on the slide."""
     (folder / "parts").mkdir(parents=True)
     for i, name in enumerate(("base", "slide", "flap")):
-        trimesh.creation.box([0.5, 0.5, 0.1]).apply_translation([0, 0, 0.3 * i]).export(
-            folder / f"parts/{name}.obj"
-        )
+        trimesh.creation.box([0.5, 0.5, 0.1]).apply_translation([0, 0, 0.3 * i]).export(folder / f"parts/{name}.obj")
     common = {"limits": [0, 2]}
     joints = [
         {"parent": "slide", "child": "flap", "type": "revolute", "axis": [0, 0, 2], "origin": [0.5, 0, 0]}
@@ -321,9 +311,7 @@ def test_chained_joints_are_posed_and_compared_relative_to_the_parent(tmp_path: 
     world = moved[2]
     angle = 0.7
     pivot = np.linalg.lstsq(np.eye(3) - world[:3, :3], world[:3, 3], rcond=None)[0]
-    star = change(
-        perfect_twin(truth), 1, lambda j: {"parent": 0, "pivot": tuple(pivot), "states": (0.0, angle)}
-    )
+    star = change(perfect_twin(truth), 1, lambda j: {"parent": 0, "pivot": tuple(pivot), "states": (0.0, angle)})
     again = evaluate(write_run(tmp_path / "star", truth, star), tmp_path / "truth")
     assert again["joints"][1]["motion_deg"] == pytest.approx(0, abs=1e-5)
 
@@ -343,9 +331,7 @@ def test_paris_and_artgs_truth(tmp_path: Path, many: bool) -> None:
             box.copy().apply_translation([2 + i, 0, 0]).export(folder / state / name)
     (folder / "trans.json").write_text(json.dumps({"input": {}, "trans_info": movers if many else lid}))
     truth = load_truth(tmp_path)
-    assert [p.name for p in truth.parts] == (
-        ["static", "dynamic_0", "dynamic_1"] if many else ["static", "dynamic"]
-    )
+    assert [p.name for p in truth.parts] == (["static", "dynamic_0", "dynamic_1"] if many else ["static", "dynamic"])
     hinge = truth.joints[0]
     assert (hinge.type, hinge.motion) == ("revolute", pytest.approx(np.radians(-90)))
     assert hinge.axis == pytest.approx([0, 0, 1]) and hinge.pivot == pytest.approx([0, 0.5, 0])
@@ -367,9 +353,7 @@ def test_swapped_parts_are_matched_by_geometry_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.captures
-@pytest.mark.parametrize(
-    "name", ["mw_lever", "mw_window", "fk_hinge_cabinet", "ss_cabinet5", "inf_dishwasher"]
-)
+@pytest.mark.parametrize("name", ["mw_lever", "mw_window", "fk_hinge_cabinet", "ss_cabinet5", "inf_dishwasher"])
 def test_truth_of_the_development_captures(captures: Path, name: str) -> None:
     truth = load_truth(captures / name)
     twin = perfect_twin(truth)

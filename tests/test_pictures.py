@@ -90,9 +90,7 @@ def test_every_joint_has_its_turn():
     assert list(values.argmax(0)) == sorted(values.argmax(0))
 
 
-def test_the_summary_has_a_row_a_state_and_shows_what_moved(
-    scene: tuple[Gaussians, Twin, Camera], tmp_path: Path
-):
+def test_the_summary_has_a_row_a_state_and_shows_what_moved(scene: tuple[Gaussians, Twin, Camera], tmp_path: Path):
     gaussians, twin, camera = scene
     photo = np.zeros((60, 80, 4), np.uint8)  # transparent: white in the sheet
     states = [(View(camera, photo, "x"), twin.at_state(s)) for s in (0, 1)]

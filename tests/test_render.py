@@ -258,9 +258,7 @@ def test_screen_gradient_statistics(channels):
     h = 1e-5
 
     def loss(dx, dy):
-        shifted = Camera(
-            view.T_world_camera, view.fx, view.fy, view.cx + dx, view.cy + dy, view.width, view.height
-        )
+        shifted = Camera(view.T_world_camera, view.fx, view.fy, view.cx + dx, view.cy + dy, view.width, view.height)
         return draw(one, shifted).rgb.square().sum().item()
 
     slope = math.hypot(loss(h, 0) - loss(-h, 0), loss(0, h) - loss(0, -h)) / (2 * h)
@@ -302,9 +300,7 @@ def test_spherical_harmonics_are_orthonormal_and_have_the_usual_signs():
     torch.testing.assert_close(gram, eye, atol=0.03, rtol=0)
     x, y, z = d[:, 0], d[:, 1], d[:, 2]
     for k, part in ((1, -y), (2, z), (3, -x), (4, x * y), (5, -y * z), (7, -x * z), (10, x * y * z)):
-        assert (basis[:, k] * part).mean() > 0.99 * (
-            basis[:, k].square().mean() * part.square().mean()
-        ).sqrt()
+        assert (basis[:, k] * part).mean() > 0.99 * (basis[:, k].square().mean() * part.square().mean()).sqrt()
 
 
 def test_colours_are_clamped_at_zero_and_other_sizes_refused():

@@ -162,9 +162,7 @@ def test_parallel_works_after_a_fork():
     program = "import os, sys; from hingesplat.simd import parallel\n"
     program += "f = lambda t, threads: None\nparallel(f, 2)\npid = os.fork()\nparallel(f, 2)\n"
     program += "sys.exit(os.waitpid(pid, 0)[1] if pid else 0)"
-    subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", program], check=True, timeout=60, env=_environment({})
-    )
+    subprocess.run([sys.executable, "-W", "ignore", "-c", program], check=True, timeout=60, env=_environment({}))
 
 
 def test_builds_differ_by_source_and_planes(tmp_path):

@@ -43,9 +43,7 @@ def posed_truth(truth: Path, state: int) -> list[trimesh.Trimesh]:
 
 
 def manifold(mesh: trimesh.Trimesh) -> manifold3d.Manifold:
-    return manifold3d.Manifold(
-        manifold3d.Mesh(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32))
-    )
+    return manifold3d.Manifold(manifold3d.Mesh(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)))
 
 
 def test_solids_are_closed_and_of_the_right_volume() -> None:
@@ -55,9 +53,7 @@ def test_solids_are_closed_and_of_the_right_volume() -> None:
     assert rod.volume == pytest.approx(np.pi * 0.01 * 0.5 + 4 / 3 * np.pi * 0.001, rel=0.05)
 
 
-@pytest.mark.parametrize(
-    "solid", [box((0, 0, 0), (1, 2, 3), PLAIN), capsule((0, 0, 0), (1, 2, 3), 0.4, PLAIN)]
-)
+@pytest.mark.parametrize("solid", [box((0, 0, 0), (1, 2, 3), PLAIN), capsule((0, 0, 0), (1, 2, 3), 0.4, PLAIN)])
 def test_normals_point_outward(solid: tuple) -> None:
     mesh = solid_mesh(solid)
     for patch in solid:

@@ -13,9 +13,7 @@ from hingesplat.twin import Joint, JointStd, JointType, Part, Twin
 
 def joint(child: int, parent: int, type: JointType, axis: tuple[float, float, float]) -> Joint:
     pivot = (0.5, -0.2, 0.1 * child)
-    return Joint(
-        child, parent, type, axis, pivot, (0.0, 0.7), (-0.1, 1.5), JointStd(0.1, 0.002, 0.003), 0.9, "ok"
-    )
+    return Joint(child, parent, type, axis, pivot, (0.0, 0.7), (-0.1, 1.5), JointStd(0.1, 0.002, 0.003), 0.9, "ok")
 
 
 def twin() -> Twin:
@@ -46,9 +44,7 @@ def test_joints_agree_with_screws() -> None:
     axis = (2 / 3, -1 / 3, 2 / 3)
     j = joint(1, 0, "revolute", axis)
     np.testing.assert_allclose(j.transform(0.4), revolute(axis, j.pivot, 0.4), atol=1e-12)
-    np.testing.assert_allclose(
-        joint(1, 0, "prismatic", axis).transform(0.4), prismatic(axis, 0.4), atol=1e-12
-    )
+    np.testing.assert_allclose(joint(1, 0, "prismatic", axis).transform(0.4), prismatic(axis, 0.4), atol=1e-12)
     np.testing.assert_array_equal(joint(1, 0, "fixed", axis).transform(0.4), np.eye(4))
 
 

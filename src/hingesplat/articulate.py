@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from hingesplat.capture import View
@@ -239,7 +239,7 @@ def _match(g: Gaussians, poses: PoseDelta, fitted: Sequence[Gaussians], extent: 
     matches = []
     for state, own in enumerate(fitted):
         moved = move(g.means, g.part, R[state], t[state])
-        distance, index = cKDTree(own.means.numpy()).query(moved.numpy())
+        distance, index = map(np.asarray, KDTree(own.means.numpy()).query(moved.numpy()))
         rows = np.flatnonzero(distance < 0.02 * extent)
         matches.append(_Targets(torch.from_numpy(rows), own.means[torch.from_numpy(index[rows])]))
     return matches
@@ -268,7 +268,10 @@ def _physics(
         near = rows < len(g)
         rows, points = rows[near], points[near]
         if config.vector_weight:
-            total = total + config.vector_weight * vector_loss(g.means[rows], points, p[rows], R[state], t[state]) / extent**2
+            total = (
+                total
+                + config.vector_weight * vector_loss(g.means[rows], points, p[rows], R[state], t[state]) / extent**2
+            )
         if config.art_weight:
             with torch.no_grad():
                 R_hat, _ = fit_parts(g.means[rows], points, p[rows])

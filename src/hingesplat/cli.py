@@ -325,7 +325,9 @@ def show_joints(console: Console, twin: "Twin") -> None:
         console.print("No joints: the twin is static.")
         return
     names = {part.id: part.name for part in twin.parts}
-    table = Table("part", "type", "axis", "pivot", "range", "conf.", title="Joints found", box=SIMPLE_HEAD)
+    table = Table(title="Joints found", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for title in ("part", "type", "axis", "pivot", "range", "conf."):
+        table.add_column(title, no_wrap=title != "part")
     for j in twin.joints:
         turns = j.type == "revolute"
         low, high = (degrees(v) if turns else v for v in j.limits)

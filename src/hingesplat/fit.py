@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from hingesplat.capture import View, visual_hull
@@ -59,7 +59,7 @@ class FitConfig:
 def start_from_points(points: np.ndarray, spacing: float, generator: torch.Generator) -> Gaussians:
     """Grey, half-opaque balls on points (n, 3), each as wide as the distance to its neighbours."""
     n = len(points)
-    distance = cKDTree(points).query(points, min(4, n))[0][:, 1:].mean(1) if n > 1 else np.full(n, spacing)
+    distance = KDTree(points).query(points, min(4, n))[0][:, 1:].mean(1) if n > 1 else np.full(n, spacing)
     means = torch.from_numpy(points.astype(np.float32))
     log_scales = torch.from_numpy(np.log(np.maximum(distance, 1e-4) * 0.8).astype(np.float32))
     return Gaussians(
@@ -76,7 +76,7 @@ def hull_shell(views: Sequence[View], n: int, rng: np.random.Generator) -> tuple
     """n points in the outer voxels of the visual hull, and the object's extent (longest side)."""
     points, voxel = visual_hull(views, 96)
     extent = float((points.max(0) - points.min(0)).max())
-    neighbours = cKDTree(points).query_ball_point(points, 2.5 * voxel, return_length=True)
+    neighbours = KDTree(points).query_ball_point(points, 2.5 * voxel, return_length=True)
     weight = np.where(neighbours < 0.85 * neighbours.max(), 1.0, 0.15)
     chosen = rng.choice(len(points), n, replace=len(points) < n, p=weight / weight.sum())
     return points[chosen] + rng.uniform(-0.5, 0.5, (n, 3)) * voxel, extent

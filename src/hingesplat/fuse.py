@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 import torch
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
 from hingesplat.gaussians import Gaussians, concatenate, posed
@@ -32,7 +32,7 @@ class FuseConfig:
 
 def motion_richness(points: np.ndarray, other: np.ndarray) -> float:
     """D_{t→1−t}: mean distance of points (n, 3) to their nearest of the other state (m, 3)."""
-    return float(cKDTree(other).query(points)[0].mean())
+    return float(KDTree(other).query(points)[0].mean())
 
 
 def fusion_weight(points0: np.ndarray, points1: np.ndarray) -> float:
@@ -79,7 +79,7 @@ def _new_surface(first: Gaussians, back: Gaussians, radius: float) -> torch.Tens
     for part in back.part.unique():
         mine, known = back.part == part, first.means[first.part == part]
         if len(known):
-            distance = cKDTree(known.numpy()).query(back.means[mine].numpy())[0]
+            distance = KDTree(known.numpy()).query(back.means[mine].numpy())[0]
             new[mine] = torch.from_numpy(distance > radius)
     return new
 

@@ -83,9 +83,7 @@ class Gaussians:
         try:
             tensors = load_file(str(path))
         except SafetensorError as e:
-            raise HingesplatError(
-                f"{path}: not a readable safetensors file; run the stage that writes it again"
-            ) from e
+            raise HingesplatError(f"{path}: not a readable safetensors file; run the stage that writes it again") from e
         missing = [f.name for f in fields(Gaussians) if f.name not in tensors]
         if missing:
             raise HingesplatError(f"{path}: lacks {', '.join(missing)}; it was not written by this version")

@@ -1,4 +1,4 @@
-"""From rigid motions to joints: the type by model comparison, then a refinement with one degree of freedom (section 6)."""
+"""From rigid motions to joints: the type by model comparison, then a constrained refinement (section 6)."""
 
 import math
 from collections.abc import Sequence
@@ -244,9 +244,7 @@ def _losses_by_part(
     rows = []
     for s in range(1, len(training)):
         for view in training[s]:
-            r = draw_state(
-                g, R[s], t[s], view.camera, sh_offset=sh[s], background=torch.ones(3), channels=membership
-            )
+            r = draw_state(g, R[s], t[s], view.camera, sh_offset=sh[s], background=torch.ones(3), channels=membership)
             error = (four_planes(r) - view.image).abs().mean(0)
             region = torch.nn.functional.max_pool2d(r.channels[None], 15, 1, 7)[0] > 0.3
             area = region.flatten(1).sum(1)

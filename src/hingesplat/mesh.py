@@ -141,17 +141,13 @@ def tangent_planes(camera: Camera, depth: np.ndarray) -> np.ndarray:
     return out
 
 
-def close_surface(
-    distance: np.ndarray, lower: np.ndarray, voxel: float, config: MeshConfig
-) -> trimesh.Trimesh | None:
+def close_surface(distance: np.ndarray, lower: np.ndarray, voxel: float, config: MeshConfig) -> trimesh.Trimesh | None:
     """The zero level of a signed distance grid as a watertight manifold; cavities filled, floaters dropped.
 
     ``lower`` (3,) is the centre of voxel (0, 0, 0). None where there is no closed surface.
     """
     padded = np.pad(distance, 1, constant_values=1.0)
-    padded = np.where(
-        np.abs(padded) < 1e-3, np.float32(1e-3), padded
-    )  # no vertex on a grid point: no slivers
+    padded = np.where(np.abs(padded) < 1e-3, np.float32(1e-3), padded)  # no vertex on a grid point: no slivers
     if not (padded < 0).any():
         return None
     vertices, faces, _, _ = marching_cubes(padded, 0.0, gradient_direction="descent")
@@ -214,9 +210,7 @@ def hull_mesh(gaussians: Gaussians) -> trimesh.Trimesh:
         pass
     size = np.ptp(points, axis=0)
     size = np.maximum(size, max(1e-3 * size.max(), 1e-6))
-    return trimesh.creation.box(
-        size, trimesh.transformations.translation_matrix((points.max(0) + points.min(0)) / 2)
-    )
+    return trimesh.creation.box(size, trimesh.transformations.translation_matrix((points.max(0) + points.min(0)) / 2))
 
 
 def _depth_views(
@@ -255,9 +249,7 @@ def _depth_views(
             for k, i in enumerate(ids):
                 T_part_camera = np.linalg.inv(poses.get(i, np.eye(4))) @ camera.T_world_camera
                 own = solid & (channels[k] > 0.8 * alpha)
-                views[i].append(
-                    DepthView(replace(camera, T_world_camera=T_part_camera), depth, own, rgb, planes)
-                )
+                views[i].append(DepthView(replace(camera, T_world_camera=T_part_camera), depth, own, rgb, planes))
     return views
 
 
@@ -355,9 +347,7 @@ def _pixels(points: np.ndarray, view: DepthView) -> tuple[np.ndarray, np.ndarray
     return index, u[index], v[index], z[index]
 
 
-def _vertex_colours(
-    mesh: trimesh.Trimesh, part: Gaussians, views: list[DepthView], tolerance: float
-) -> np.ndarray:
+def _vertex_colours(mesh: trimesh.Trimesh, part: Gaussians, views: list[DepthView], tolerance: float) -> np.ndarray:
     """(n, 4) uint8: the mean of the pixels that see a vertex; else the colour of the nearest Gaussian."""
     total, weight = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices))
     for view in views:

@@ -141,9 +141,7 @@ def _grid(rows: list[list[Image.Image]], titles: Sequence[str]) -> Image.Image:
     head = 30
     width = max(p.width for row in rows for p in row)
     heights = [max(p.height for p in row) for row in rows]
-    sheet = Image.new(
-        "RGB", (len(titles) * (width + _GAP) + _GAP, head + sum(heights) + _GAP * len(rows)), "white"
-    )
+    sheet = Image.new("RGB", (len(titles) * (width + _GAP) + _GAP, head + sum(heights) + _GAP * len(rows)), "white")
     draw = ImageDraw.Draw(sheet)
     for column, title in enumerate(titles):
         draw.text((_GAP + column * (width + _GAP) + width / 2, head / 2), title, _INK, font, anchor="mm")

@@ -51,7 +51,9 @@ def draw_state(
     *,
     sh_offset: Tensor | None = None,
     means: Tensor | None = None,
-    **options: Tensor | None,
+    background: Tensor | None = None,
+    channels: Tensor | None = None,
+    screen_gradient: Tensor | None = None,
 ) -> Rendering:
     """Canonical Gaussians moved by their parts' poses R (parts, 3, 3), t (parts, 3), and rasterised.
 
@@ -67,7 +69,17 @@ def draw_state(
         sh = torch.cat([sh[:, :1] + sh_offset[:, None], sh[:, 1:]], 1)
     centre = torch.as_tensor(camera.centre, dtype=means.dtype)
     directions = torch.nn.functional.normalize(means - centre, dim=1)
-    return rasterize(means, quats, g.scales, g.opacities, sh_to_rgb(sh, directions), camera, **options)
+    return rasterize(
+        means,
+        quats,
+        g.scales,
+        g.opacities,
+        sh_to_rgb(sh, directions),
+        camera,
+        channels=channels,
+        background=background,
+        screen_gradient=screen_gradient,
+    )
 
 
 def move(means: Tensor, part: Tensor, R: Tensor, t: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from hingesplat.gaussians import Gaussians
@@ -49,13 +49,13 @@ def register(
     A light pull along the tangent keeps texture in place where planes slide on themselves. Pairs farther apart than the
     shrinking radius (fractions of the extent) are left out; directions that no pair constrains stay as they are.
     """
-    tree = cKDTree(target.features(colour_length * extent))
+    tree = KDTree(target.features(colour_length * extent))
     for i in range(iterations):
         radius = extent * start_radius * (end_radius / start_radius) ** (i / max(iterations - 1, 1))
         moved = source.points @ T[:3, :3].T + T[:3, 3]
         # Colours shift with the light: compare them less their median difference over the pairs.
         query = np.concatenate([moved, source.colours * colour_length * extent], 1)
-        distance, index = tree.query(query)
+        distance, index = map(np.asarray, tree.query(query))
         near = distance < radius
         if near.sum() < 12:
             return T

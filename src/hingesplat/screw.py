@@ -95,9 +95,7 @@ def revolute_torch(
     return _from_turn(turn, -(turn @ pivot[..., None])[..., 0])
 
 
-def prismatic_torch(
-    axis: Float[Tensor, "*batch 3"], slide: Float[Tensor, "*batch"]
-) -> Float[Tensor, "*batch 4 4"]:
+def prismatic_torch(axis: Float[Tensor, "*batch 3"], slide: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 4 4"]:
     """``prismatic`` with gradients to both. The axis is normalised here."""
     t = torch.nn.functional.normalize(axis, dim=-1) * slide[..., None]
     return _from_turn(torch.zeros_like(t)[..., None].expand(*t.shape, 3), t)

@@ -8,12 +8,13 @@ positions that cross the object. Nothing is matched by appearance alone, so repe
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+import torch
+from numba import njit
 from scipy.ndimage import distance_transform_edt
 
 from hingesplat.screw import prismatic, revolute
+from hingesplat.simd import parallel
 from hingesplat.visibility import FREE, SURFACE, Sight, ask
-
 
 COLOUR_SCALE = 0.2
 """RGB difference at which a surface of another colour counts half."""
@@ -64,8 +65,9 @@ def score_volume(
     np.add.at(colour, tuple(index.T), colours)
     np.add.at(count, tuple(index.T), 1)
     colour /= np.maximum(count, 1)[..., None]
-    distance, nearest = distance_transform_edt(count == 0, return_indices=True)
-    near = tuple(nearest)
+    nearest = distance_transform_edt(count == 0, return_distances=False, return_indices=True)
+    near = tuple(np.asarray(nearest))
+    distance = np.linalg.norm(np.asarray(near) - np.indices(count.shape), axis=0)
     score = occupied[near] * np.exp(-0.5 * np.maximum(distance - 0.5, 0) ** 2)
     score = np.where(distance > 1.5, np.where(views_free >= 3, -1.0, HIDDEN_SCORE), score)
     return ScoreVolume(low, voxel, score.astype(np.float32), np.ascontiguousarray(colour[near]))
@@ -82,10 +84,8 @@ HIDDEN32 = np.float32(HIDDEN_SCORE)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def _sum(
-    q, colours, shift, origin, inverse_voxel, score, volume_colour, give_up
-):  # pragma: no cover - compiled
-    """Mean score of points q + shift; surfaces count by how constant the colour difference is (shading may shift it)."""
+def _sum(q, colours, shift, origin, inverse_voxel, score, volume_colour, give_up):  # pragma: no cover - compiled
+    """Mean score of points q + shift; surfaces count by how constant the colour difference is: light shifts it."""
     nx, ny, nz = score.shape
     m = q.shape[0]
     zero = np.float32(0)
@@ -136,18 +136,30 @@ def _crosses_box(px, py, pz, d, low, high):  # pragma: no cover - compiled
     return near <= far
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _scan_revolute(
-    seeds, colours, directions, angles, origin, voxel, score, volume_colour, low, high, reach
+    seeds,
+    colours,
+    directions,
+    angles,
+    origin,
+    voxel,
+    score,
+    volume_colour,
+    low,
+    high,
+    reach,
+    best,
+    pivots,
+    thread,
+    threads,
 ):  # pragma: no cover - compiled
     n_d, n_a, m = directions.shape[0], angles.shape[0], seeds.shape[0]
-    best = np.full((n_d, n_a), np.float32(-1))
-    pivots = np.zeros((n_d, n_a, 3))
     c = np.zeros(3)
     for i in range(m):
         for a in range(3):
             c[a] += seeds[i, a] / m
-    for job in prange(n_d * n_a):
+    for job in range(thread, n_d * n_a, threads):
         d, theta = directions[job // n_a], angles[job % n_a]
         helper = np.zeros(3)
         helper[np.argmin(np.abs(d))] = 1
@@ -196,21 +208,18 @@ def _scan_revolute(
                     pivots[job // n_a, job % n_a, 1] = py
                     pivots[job // n_a, job % n_a, 2] = pz
         best[job // n_a, job % n_a] = top
-    return best, pivots
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _scan_prismatic(
-    seeds, colours, directions, slides, origin, voxel, score, volume_colour
+    seeds, colours, directions, slides, origin, voxel, score, volume_colour, best, thread, threads
 ):  # pragma: no cover - compiled
     n_d, n_s = directions.shape[0], slides.shape[0]
-    best = np.full((n_d, n_s), np.float32(-1))
-    for job in prange(n_d * n_s):
+    for job in range(thread, n_d * n_s, threads):
         shift = (directions[job // n_s] * slides[job % n_s]).astype(np.float32)
         best[job // n_s, job % n_s] = _sum(
             seeds, colours, shift, origin, np.float32(1 / voxel), score, volume_colour, np.float32(-9)
         )
-    return best
 
 
 @dataclass(frozen=True)
@@ -261,24 +270,25 @@ def scan(
     seeds32, colours32 = seeds.astype(np.float32), colours.astype(np.float32)
     low, high = volume.origin, volume.origin + (np.array(volume.score.shape) - 1) * volume.voxel
     reach = float(np.linalg.norm(high - low)) / 2
-    centroid = seeds.mean(0)
+    centroid, threads = seeds.mean(0), torch.get_num_threads()
     found: list[Motion] = []
     if "revolute" in kinds:
         angles = values if values is not None else both_signs(np.radians(np.arange(5, 151, 5)))
         angles = angles[np.abs(angles) > 1e-3]
         box = (low, high) if near is None else (near.pivot - 4 * volume.voxel, near.pivot + 4 * volume.voxel)
-        score, pivots = _scan_revolute(seeds32, colours32, directions, angles, *grid, *box, reach)
+        score = np.full((len(directions), len(angles)), -1, np.float32)
+        pivots = np.zeros((*score.shape, 3))
+        parallel(_scan_revolute, threads, seeds32, colours32, directions, angles, *grid, *box, reach, score, pivots)
         found += [
             Motion("revolute", directions[i], pivots[i, j], float(angles[j]), float(score[i, j]))
             for i, j in np.ndindex(score.shape)
         ]
     if "prismatic" in kinds:
         slides = (
-            values
-            if values is not None
-            else both_signs(np.arange(1, 1.2 * reach / volume.voxel, 0.5) * volume.voxel)
+            values if values is not None else both_signs(np.arange(1, 1.2 * reach / volume.voxel, 0.5) * volume.voxel)
         )
-        score = _scan_prismatic(seeds32, colours32, directions, slides, *grid)
+        score = np.full((len(directions), len(slides)), -1, np.float32)
+        parallel(_scan_prismatic, threads, seeds32, colours32, directions, slides, *grid, score)
         found += [
             Motion("prismatic", directions[i], centroid, float(slides[j]), float(score[i, j]))
             for i, j in np.ndindex(score.shape)

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.cluster.vq import kmeans2
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from hingesplat.capture import View
 from hingesplat.gaussians import SH_C0, Gaussians
@@ -21,7 +21,6 @@ from hingesplat.register import Sheet, normals_of, register
 from hingesplat.screw import matrix_to_screw
 from hingesplat.search import Motion, ScoreVolume, scan, score_volume
 from hingesplat.visibility import COLOUR, FREE, HIDDEN, SURFACE, Sight, ask, look
-
 
 HIDDEN_SEED_COST = 0.5
 """Cost of a seed that a motion takes out of everybody's sight."""
@@ -73,13 +72,11 @@ class Surface:
 
     def rows(self, index: np.ndarray) -> "Surface":
         """The subset ``index``, seen by the same cameras."""
-        return Surface(
-            self.points[index], self.colours[index], self.index[index], self.sight, self.normals[index]
-        )
+        return Surface(self.points[index], self.colours[index], self.index[index], self.sight, self.normals[index])
 
     def blurred(self, k: int = 8) -> np.ndarray:
         """(n, 3) mean colour of each point and its neighbours: what a coarse voxel would show."""
-        index = cKDTree(self.points).query(self.points, min(k, len(self.points)))[1]
+        index = KDTree(self.points).query(self.points, min(k, len(self.points)))[1]
         return self.colours[index].mean(1)
 
     @property
@@ -135,7 +132,7 @@ def components(points: np.ndarray, radius: float) -> np.ndarray:
     """(n,) label of the connected piece each point belongs to, neighbours being closer than ``radius``."""
     if len(points) == 0:
         return np.zeros(0, int)
-    pairs = cKDTree(points).query_pairs(radius, output_type="ndarray")
+    pairs = KDTree(points).query_pairs(radius, output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
     return connected_components(graph, directed=False)[1]
 
@@ -151,7 +148,7 @@ def groups_to_try(points: np.ndarray, extent: float, seed: int) -> list[np.ndarr
         groups.append(index)
         patches = min(len(index) // 60, 10)
         if patches >= 2:
-            which = kmeans2(points[index], patches, seed=seed, minit="++")[1]
+            which = kmeans2(points[index], patches, rng=np.random.default_rng(seed), minit="++")[1]
             groups += [index[which == p] for p in range(patches) if (which == p).sum() >= 12]
     return groups
 
@@ -216,17 +213,13 @@ def refine_motion(
     u = np.cross(motion.axis, helper)
     u /= np.linalg.norm(u)
     w = np.cross(motion.axis, u)
-    tilted = np.array(
-        [motion.axis + tilt * (a * u + b * w) for a in (-1, 0, 1) for b in (-1, 0, 1) if a or b]
-    )
+    tilted = np.array([motion.axis + tilt * (a * u + b * w) for a in (-1, 0, 1) for b in (-1, 0, 1) if a or b])
     tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
     values = motion.value + np.linspace(-1, 1, 9) * (
         np.radians(spread_deg) if motion.kind == "revolute" else 2 * volume.voxel
     )
     kinds = (motion.kind,)
-    (straight,) = scan(
-        points, colours, motion.axis[None], volume, kinds=kinds, values=values, near=motion, keep=1
-    )
+    (straight,) = scan(points, colours, motion.axis[None], volume, kinds=kinds, values=values, near=motion, keep=1)
     (best,) = scan(points, colours, tilted, volume, kinds=kinds, values=values, near=motion, keep=1)
     # The volume is coarse: an axis is tilted only for a clear gain, and the photographs settle the rest later.
     return best if best.score > straight.score + 0.02 else straight
@@ -248,10 +241,7 @@ def label_costs(
         contradiction = np.clip(free / 0.25, 0, 1)
         colour = np.clip((answer[:, COLOUR] - 0.05) / 0.5, 0, 1) * seen / np.maximum(seen + hidden, 1e-6)
         columns.append(
-            contradiction
-            + 0.5 * colour
-            + hidden_cost * hidden
-            + (0.0 if motion is None else 0.1 + 0.1 * travel)
+            contradiction + 0.5 * colour + hidden_cost * hidden + (0.0 if motion is None else 0.1 + 0.1 * travel)
         )
     return np.stack(columns, 1)
 
@@ -265,7 +255,7 @@ def neighbour_weights(points: np.ndarray, colours: np.ndarray, radius: float, k:
     """(n, n) sparse weights of the k nearest points, less for distance and for another colour."""
     n = len(points)
     k = min(k, n - 1)
-    distance, index = cKDTree(points).query(points, k + 1)
+    distance, index = KDTree(points).query(points, k + 1)
     row = np.repeat(np.arange(n), k)
     column = index[:, 1:].ravel()
     difference = np.linalg.norm(colours[row] - colours[column], axis=1)
@@ -282,7 +272,7 @@ class Labelling:
 
     surfaces: tuple[Surface, Surface]
     weights: tuple[csr_matrix, csr_matrix]
-    trees: tuple[cKDTree, cKDTree]
+    trees: tuple[KDTree, KDTree]
     extent: float
     smoothness: float = 0.25
     consistency: float = 0.6
@@ -290,9 +280,7 @@ class Labelling:
     @staticmethod
     def of(surfaces: tuple[Surface, Surface], extent: float) -> "Labelling":
         w0, w1 = (neighbour_weights(s.points, s.colours, 0.025 * extent) for s in surfaces)
-        return Labelling(
-            surfaces, (w0, w1), (cKDTree(surfaces[0].points), cKDTree(surfaces[1].points)), extent
-        )
+        return Labelling(surfaces, (w0, w1), (KDTree(surfaces[0].points), KDTree(surfaces[1].points)), extent)
 
     def costs(self, motions: Sequence[Motion]) -> list[np.ndarray]:
         a, b = self.surfaces
@@ -308,7 +296,7 @@ class Labelling:
             columns = []
             for motion in [None, *motions]:
                 T = np.eye(4) if motion is None else motion.T if s == 0 else np.linalg.inv(motion.T)
-                distance, index = self.trees[1 - s].query(moved(self.surfaces[s].points, T))
+                distance, index = map(np.asarray, self.trees[1 - s].query(moved(self.surfaces[s].points, T)))
                 columns.append(np.where(distance < 0.025 * self.extent, index, -1))
             result.append(np.stack(columns, 1))
         return result
@@ -338,9 +326,7 @@ class Labelling:
             q = updated
         return (q[0].argmax(1), q[1].argmax(1)), energy
 
-    def solve(
-        self, motions: Sequence[Motion], part_cost: float, parts: int | None
-    ) -> tuple[list[Motion], Labels]:
+    def solve(self, motions: Sequence[Motion], part_cost: float, parts: int | None) -> tuple[list[Motion], Labels]:
         """Drop motions one by one as long as doing without costs less than a part; then the labels of the rest."""
         motions = list(motions)
         costs, partners = self.costs(motions), self.partners(motions)
@@ -382,10 +368,7 @@ def segment(
     rng = np.random.default_rng(seed)
     low, high = bounds([g.means.numpy() for g in gaussians])
     extent = float((high - low).max())
-    sights = [
-        look(g, v, config.sight_size, config.tolerance * extent)
-        for g, v in zip(gaussians, views, strict=True)
-    ]
+    sights = [look(g, v, config.sight_size, config.tolerance * extent) for g, v in zip(gaussians, views, strict=True)]
     surfaces = (on_surface(gaussians[0], sights[0]), on_surface(gaussians[1], sights[1]))
     seeds = []
     for s in (0, 1):
@@ -394,9 +377,7 @@ def segment(
         seeds.append(index[thin(surface.points[index], 0.012 * extent, rng)])
 
     def volume(s: int, cells: int) -> ScoreVolume:
-        return score_volume(
-            surfaces[s].points, surfaces[s].colours, sights[s], sights[1 - s], low, high, cells
-        )
+        return score_volume(surfaces[s].points, surfaces[s].colours, sights[s], sights[1 - s], low, high, cells)
 
     coarse, fine = [volume(s, config.cells) for s in (0, 1)], [volume(s, 2 * config.cells) for s in (0, 1)]
     pool = propose(surfaces, seeds, coarse, fine, extent, config, rng)
@@ -417,7 +398,7 @@ def segment(
     costs = np.concatenate([costs, costs_of(pool[costs.shape[1] :])], 1)
     chosen = [pool[k] for k in select_motions(costs, config, parts)]
     problem = Labelling.of(surfaces, extent)
-    owned: Labels = tuple(np.zeros(len(x.points), int) for x in surfaces)
+    owned: Labels = (np.zeros(len(surfaces[0].points), int), np.zeros(len(surfaces[1].points), int))
     for round_ in range(config.rounds):
         chosen = [
             _refit(m, own, surfaces, fine, extent, 6.0 / 2**round_, config, rng)
@@ -444,11 +425,10 @@ def _owners(
     config: SegmentConfig,
     owned: "Labels | None",
 ) -> list[tuple[Motion, tuple[np.ndarray, np.ndarray]]]:
-    """Each motion with the surface points of both states to refine it on: its labelled points, or at first its seeds."""
+    """Each motion with the points of both states to refine it on: its labelled points, or at first its seeds."""
     if owned is not None:
         return [
-            (m, (np.flatnonzero(owned[0] == k + 1), np.flatnonzero(owned[1] == k + 1)))
-            for k, m in enumerate(motions)
+            (m, (np.flatnonzero(owned[0] == k + 1), np.flatnonzero(owned[1] == k + 1))) for k, m in enumerate(motions)
         ]
     owner = np.where(costs.min(1) < config.explained_cost, costs.argmin(1), -1)
     first, second = owner[: len(seeds[0])], owner[len(seeds[0]) :]
@@ -477,7 +457,7 @@ def split_pieces(
         if len(large) == 0:
             continue
         centres = np.stack([both[piece == p].mean(0) for p in large])
-        tree = [cKDTree(both[piece == p]) for p in large]
+        tree = [KDTree(both[piece == p]) for p in large]
         distance = np.stack([t.query(both)[0] for t in tree], 1)
         nearest = distance.argmin(1)
         split = np.split(nearest, [len(rows[0])])
@@ -572,7 +552,9 @@ def _refit(
     chosen = rng.choice(own[s], min(2 * config.seeds_per_search, len(own[s])), replace=False)
     mine, other = surfaces[s].rows(chosen), surfaces[1 - s]
     start = motion if s == 0 else inverted(motion)
-    fit = polished([start, refine_motion(start, mine.points, mine.colours, fine[1 - s], spread_deg)], mine, other, extent)
+    fit = polished(
+        [start, refine_motion(start, mine.points, mine.colours, fine[1 - s], spread_deg)], mine, other, extent
+    )
     return fit if s == 0 else inverted(fit)
 
 
@@ -600,7 +582,7 @@ def registered(motion: Motion, source: Sheet, target: Sheet, extent: float) -> M
 
 def spread_labels(points: np.ndarray, surface: Surface, labels: np.ndarray) -> np.ndarray:
     """(n,) labels for all Gaussians: those off the surface take their nearest surface point's."""
-    nearest = cKDTree(surface.points).query(points)[1]
+    nearest = KDTree(surface.points).query(points)[1]
     spread = labels[nearest]
     spread[surface.index] = labels
     return spread

@@ -596,9 +596,7 @@ def pconcat(typingctx, first, second):
 
     def code(context, builder, sig, args):
         heads = cgutils.unpack_tuple(builder, args[0], len(first))
-        return context.make_tuple(
-            builder, result, heads + cgutils.unpack_tuple(builder, args[1], len(second))
-        )
+        return context.make_tuple(builder, result, heads + cgutils.unpack_tuple(builder, args[1], len(second)))
 
     return result(first, second), code
 

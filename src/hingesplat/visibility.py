@@ -9,11 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import njit
 
 from hingesplat.capture import View
 from hingesplat.gaussians import Gaussians
 from hingesplat.render import render
+from hingesplat.simd import parallel
 
 FREE, SURFACE, HIDDEN, COLOUR = range(4)
 """Columns of ``ask``'s answer."""
@@ -66,10 +67,10 @@ def look(gaussians: Gaussians, views: Sequence[View], size: int, tolerance: floa
     )
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _ask(points, colours, P, depth, rgb, tolerance, answer):  # pragma: no cover - compiled
+@njit(cache=True, nogil=True, error_model="numpy")
+def _ask(points, colours, P, depth, rgb, tolerance, answer, thread, threads):  # pragma: no cover - compiled
     views, height, width = depth.shape
-    for i in prange(points.shape[0]):
+    for i in range(thread, points.shape[0], threads):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         free = 0.0
         surface = 0.0
@@ -127,7 +128,9 @@ def ask(points: np.ndarray, colours: np.ndarray, sight: Sight) -> np.ndarray:
         Euclidean RGB difference (best of nine pixels) over the views that see it on the surface.
     """
     answer = np.empty((len(points), 4), np.float32)
-    _ask(
+    parallel(
+        _ask,
+        torch.get_num_threads(),
         np.ascontiguousarray(points, dtype=np.float32),
         np.ascontiguousarray(colours, dtype=np.float32),
         sight.P,

@@ -13,9 +13,7 @@ MIN_DEPTH = 0.1
 
 def recognises(root: Path) -> bool:
     """Whether a transforms file lies at the root, beside the state folders."""
-    return bool(_per_state(root, "train")) or (
-        (root / "transforms_train.json").is_file() and bool(state_folders(root))
-    )
+    return bool(_per_state(root, "train")) or ((root / "transforms_train.json").is_file() and bool(state_folders(root)))
 
 
 def read(root: Path) -> list[StateFrames]:

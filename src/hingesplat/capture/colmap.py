@@ -116,9 +116,7 @@ def _frame(image: _Image, lenses: dict[int, _Lens], root: Path, where: str) -> F
 def _lens(model: str, width: int, height: int, params: tuple[float, ...], where: str) -> _Lens:
     """Pinhole intrinsics; raises HingesplatError for other models and for a distortion that matters."""
     if model not in {name for name, _ in MODELS.values()}:
-        raise HingesplatError(
-            f"{where}: camera model {model} is not a pinhole; run COLMAP's image_undistorter first"
-        )
+        raise HingesplatError(f"{where}: camera model {model} is not a pinhole; run COLMAP's image_undistorter first")
     two_focals = model in ("PINHOLE", "OPENCV")
     fx, fy, cx, cy = params[:4] if two_focals else (params[0], params[0], params[1], params[2])
     rest = params[4:] if two_focals else params[3:]

@@ -90,9 +90,7 @@ def rigid(matrix: Any, where: str, tolerance: float = 1e-3) -> np.ndarray:
         raise HingesplatError(f"{where}: the pose holds NaN or infinity")
     U, s, Vt = np.linalg.svd(M[:3, :3])
     if abs(s - 1).max() > tolerance:
-        raise HingesplatError(
-            f"{where}: the pose is not rigid (its rotation scales by {s.min():.4g} to {s.max():.4g})"
-        )
+        raise HingesplatError(f"{where}: the pose is not rigid (its rotation scales by {s.min():.4g} to {s.max():.4g})")
     if np.linalg.det(U @ Vt) < 0:
         raise HingesplatError(f"{where}: the pose is not rigid (it mirrors: determinant −1)")
     if M.shape[0] == 4 and abs(M[3] - [0, 0, 0, 1]).max() > tolerance:

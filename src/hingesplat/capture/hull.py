@@ -167,9 +167,7 @@ def _children(points: np.ndarray, voxel: float) -> np.ndarray:
     return (points[:, None] + corners).reshape(-1, 3)
 
 
-def _keep(
-    views: Sequence[Silhouette], points: np.ndarray, voxel: float, final: bool
-) -> tuple[np.ndarray, np.ndarray]:
+def _keep(views: Sequence[Silhouette], points: np.ndarray, voxel: float, final: bool) -> tuple[np.ndarray, np.ndarray]:
     """The voxels that survive, and which of them need no further test since every part of them would.
 
     Before the final level a voxel stays if any part of it may: the masks are dilated by its half diagonal.
@@ -184,9 +182,7 @@ def _survives(outside: np.ndarray, seen: np.ndarray, views: int) -> np.ndarray:
     return (seen >= views / 2) & (outside <= TOLERANCE * seen)
 
 
-def _votes(
-    views: Sequence[Silhouette], points: np.ndarray, radius: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _votes(views: Sequence[Silhouette], points: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(n,) views that see each ball (point, radius) outside their mask, views that see it, worst margin.
 
     The margin is in world units, negative inside, infinite where not every view sees the point.

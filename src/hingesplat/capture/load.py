@@ -62,8 +62,7 @@ def recognise(path: Path) -> str:
             return layout
     if (path / "transforms.json").is_file() or (path / "transforms_train.json").is_file():
         raise HingesplatError(
-            f"{path}: holds a single state; put each state in a folder of its own (start/, end/) and give "
-            "their parent"
+            f"{path}: holds a single state; put each state in a folder of its own (start/, end/) and give their parent"
         )
     looked_for = "; ".join(reader.LOOKED_FOR for reader in READERS.values())
     raise HingesplatError(f"{path}: no capture found here; looked for {looked_for}")

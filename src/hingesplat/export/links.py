@@ -223,9 +223,7 @@ def _link(
         limits = (scale * limits[0], scale * limits[1])
     if mesh is None:
         token = np.eye(3) * 1e-6
-        return Link(
-            name, part, joint, parent, origin, None, (), 1e-3, np.zeros(3), token, (0.5, 0.5, 0.5), limits
-        )
+        return Link(name, part, joint, parent, origin, None, (), 1e-3, np.zeros(3), token, (0.5, 0.5, 0.5), limits)
     local = mesh.copy()
     local.apply_scale(scale)
     local.apply_translation(-origin)
@@ -243,9 +241,7 @@ def _link(
     colour = np.asarray(mesh.visual.vertex_colors)[:, :3].mean(0) / 255  # type: ignore[union-attr]
     rgb = (float(colour[0]), float(colour[1]), float(colour[2]))
     com = np.asarray(solid.center_mass)
-    return Link(
-        name, part, joint, parent, origin, local, tuple(hulls), float(solid.mass), com, inertia, rgb, limits
-    )
+    return Link(name, part, joint, parent, origin, local, tuple(hulls), float(solid.mass), com, inertia, rgb, limits)
 
 
 def _parents_first(twin: Twin) -> list[Part]:
@@ -256,9 +252,7 @@ def _parents_first(twin: Twin) -> list[Part]:
         known = {p.id for p in order}
         ready = [p for p in waiting if (joint := twin.joint_of(p.id)) is None or joint.parent in known]
         if not ready:
-            raise HingesplatError(
-                f"twin: part {waiting[0].id} hangs from no base; mend joints[].parent in twin.json"
-            )
+            raise HingesplatError(f"twin: part {waiting[0].id} hangs from no base; mend joints[].parent in twin.json")
         order += sorted(ready, key=lambda p: p.id)
         waiting = [p for p in waiting if p not in ready]
     return order

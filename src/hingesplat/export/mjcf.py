@@ -93,9 +93,7 @@ def _add_body(parent: etree._Element, link: Link, load: float) -> etree._Element
     body = etree.SubElement(parent, "body", name=link.name, pos=numbers(link.offset))
     I = link.inertia
     full = [I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2]]
-    etree.SubElement(
-        body, "inertial", pos=numbers(link.com), mass=numbers(link.mass), fullinertia=numbers(full)
-    )
+    etree.SubElement(body, "inertial", pos=numbers(link.com), mass=numbers(link.mass), fullinertia=numbers(full))
     if link.joint is not None and link.moves:
         etree.SubElement(
             body,
@@ -120,7 +118,6 @@ def _touch(a: Link, b: Link) -> bool:
         return False
     gap = 0.01 * min(float(link.mesh.extents.max()) for link in (a, b) if link.mesh is not None)
     solids = [
-        [manifold3d.Manifold.hull_points(np.asarray(h.vertices + link.origin)) for h in link.hulls]
-        for link in (a, b)
+        [manifold3d.Manifold.hull_points(np.asarray(h.vertices + link.origin)) for h in link.hulls] for link in (a, b)
     ]
     return any(p.min_gap(q, gap) < gap for p in solids[0] for q in solids[1])

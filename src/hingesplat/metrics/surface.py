@@ -21,9 +21,7 @@ def clean(mesh: trimesh.Trimesh, smallest: float = 0.1) -> trimesh.Trimesh:
     f = vertex.reshape(-1)[mesh.faces]
     edges = np.concatenate([f[:, :2], f[:, 1:]])
     n = int(f.max()) + 1
-    _, label = connected_components(
-        coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), (n, n)), False
-    )
+    _, label = connected_components(coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), (n, n)), False)
     label_of_face = label[f[:, 0]]
     area = np.bincount(label_of_face, weights=mesh.area_faces)
     keep = (area >= smallest * area.max())[label_of_face]
@@ -92,9 +90,7 @@ def surface_distance(mesh: trimesh.Trimesh, points: np.ndarray, rng: np.random.G
     on_surface = (weights[:, :, None] * triangles[chosen]).sum(1)
     _, near = KDTree(on_surface).query(points, k=12)
     pairs = chosen[near]
-    best = trimesh.triangles.closest_point(
-        triangles[pairs.ravel()], np.repeat(points, pairs.shape[1], axis=0)
-    )
+    best = trimesh.triangles.closest_point(triangles[pairs.ravel()], np.repeat(points, pairs.shape[1], axis=0))
     return np.linalg.norm(best.reshape(*pairs.shape, 3) - points[:, None], axis=-1).min(1)
 
 

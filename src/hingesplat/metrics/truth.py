@@ -81,9 +81,7 @@ def load_truth(path: Path) -> Truth:
             return _load_tree(folder, _read_json(folder / "joints.json"))
         if (folder / "trans.json").is_file():
             return _load_paris(folder, _read_json(folder / "trans.json"))
-    raise HingesplatError(
-        f"{path}: no truth here; looked for joints.json and trans.json (also in truth/, gt/)"
-    )
+    raise HingesplatError(f"{path}: no truth here; looked for joints.json and trans.json (also in truth/, gt/)")
 
 
 def load_mesh(path: Path) -> trimesh.Trimesh:
@@ -111,9 +109,7 @@ def _load_tree(folder: Path, tree: dict[str, Any]) -> Truth:
         by_child = {j["child"]: j for j in tree["joints"]}
         lost = [name for name in names[1:] if name not in by_child]
         if lost or not set(j["parent"] for j in tree["joints"]) <= set(names):
-            raise HingesplatError(
-                f"{where}: joints and parts do not form a tree ({', '.join(lost) or 'parent'})"
-            )
+            raise HingesplatError(f"{where}: joints and parts do not form a tree ({', '.join(lost) or 'parent'})")
         poses: list[dict[str, np.ndarray]] = [{names[0]: np.eye(4)}, {names[0]: np.eye(4)}]
         while len(poses[0]) < len(names):
             ready = [n for n in names if n not in poses[0] and by_child[n]["parent"] in poses[0]]

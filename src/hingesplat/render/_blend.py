@@ -105,12 +105,8 @@ def _blend_tile(build, x0, y0, x1, y1, record, stride, items, shapes, start, sto
                 dy1 = dy + _1
                 e0 = vfma(vfma(dy, c, linear), dy, constant)
                 e1 = vfma(vfma(dy1, c, linear), dy1, constant)
-                alpha0 = vselect(
-                    vand(vgt(e0, _LOG2_ALPHA_MIN), vgt(t0, floor)), vmin(_exp2(e0), _ALPHA_MAX), _0
-                )
-                alpha1 = vselect(
-                    vand(vgt(e1, _LOG2_ALPHA_MIN), vgt(t1, floor)), vmin(_exp2(e1), _ALPHA_MAX), _0
-                )
+                alpha0 = vselect(vand(vgt(e0, _LOG2_ALPHA_MIN), vgt(t0, floor)), vmin(_exp2(e0), _ALPHA_MAX), _0)
+                alpha1 = vselect(vand(vgt(e1, _LOG2_ALPHA_MIN), vgt(t1, floor)), vmin(_exp2(e1), _ALPHA_MAX), _0)
                 w0, w1 = alpha0 * t0, alpha1 * t1
                 vstore(buffer, p, t0 - w0)
                 vstore(buffer, p + PITCH, t1 - w1)
@@ -234,9 +230,7 @@ def _load_tile(build, x0, y0, x1, y1, width, height, image, g_image, buffer):
 
 
 @njit(**INNER)
-def _unblend_tile(
-    build, x0, y0, record, stride, items, slots, shapes, start, stop, floor, buffer, partial, width
-):
+def _unblend_tile(build, x0, y0, record, stride, items, slots, shapes, start, stop, floor, buffer, partial, width):
     """Front to back once more: the gradient sums of every segment into its slot of ``partial``."""
     zero = vsplat(_0)
     for entry in range(start, stop):

@@ -191,6 +191,4 @@ def fill_lists(
             sstore(shapes, p, pack(x0 % TILE, y0 % TILE, y1 - y0 + 1))
         else:
             box = (x0, x1, y0, y1)
-            _list_segments(
-                g, box, row0, row1, columns, record, stride, slot0, cursor, base, items, slots, shapes
-            )
+            _list_segments(g, box, row0, row1, columns, record, stride, slot0, cursor, base, items, slots, shapes)

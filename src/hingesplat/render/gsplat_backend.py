@@ -30,15 +30,11 @@ def rasterize(
     if not torch.cuda.is_available():
         raise HingesplatError("backend gsplat: no CUDA device; use the numba or torch backend")
     if not means.is_cuda:
-        raise HingesplatError(
-            "backend gsplat: needs CUDA tensors; move them, or use the numba or torch backend"
-        )
+        raise HingesplatError("backend gsplat: needs CUDA tensors; move them, or use the numba or torch backend")
     try:
         from gsplat import rasterization  # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        raise HingesplatError(
-            "backend gsplat: not installed; run pip install 'hingesplat[gsplat]'"
-        ) from error
+        raise HingesplatError("backend gsplat: not installed; run pip install 'hingesplat[gsplat]'") from error
 
     if len(means) == 0:  # gsplat wants at least one
         blank = means.sum() + means.new_zeros((channels.shape[1] + 5, camera.height, camera.width))
@@ -63,9 +59,7 @@ def rasterize(
         radii = meta["radii"][0]
         seen = torch.nonzero((radii > 0).all(dim=1))[:, 0]
         radius = radii[seen].amax(dim=1).to(screen_gradient.dtype)
-        meta["means2d"].register_hook(
-            lambda g: record_screen_gradient(screen_gradient, seen, g[0, seen], radius)
-        )
+        meta["means2d"].register_hook(lambda g: record_screen_gradient(screen_gradient, seen, g[0, seen], radius))
     alpha = alpha[0, :, :, 0]
     rgb, others, depth = image[0].permute(2, 0, 1).split([3, channels.shape[1], 1])
     return rgb + (1 - alpha) * background[:, None, None], depth[0], alpha, others

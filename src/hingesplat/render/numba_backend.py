@@ -61,18 +61,14 @@ def rasterize(
     shift = torch.zeros((len(colors), 2), requires_grad=screen_gradient is not None)
 
     most = CHANNEL_SIZES[-1]
-    rgb, first, depth, alpha = _Draw.apply(
-        *geometry, colors, channels[:, :most], shift, camera, background, early_stop
-    )
+    rgb, first, depth, alpha = _Draw.apply(*geometry, colors, channels[:, :most], shift, camera, background, early_stop)
     pieces = [first]
     nothing = background.new_zeros(3)
     for start in range(most, channels.shape[1], most + 3):  # the place of the colours takes three channels
         chunk = channels[:, start : start + most + 3]
         count = chunk.shape[1]
         chunk = torch.nn.functional.pad(chunk, (0, max(0, 3 - count)))
-        head, tail, _, _ = _Draw.apply(
-            *geometry, chunk[:, :3], chunk[:, 3:], shift, camera, nothing, early_stop
-        )
+        head, tail, _, _ = _Draw.apply(*geometry, chunk[:, :3], chunk[:, 3:], shift, camera, nothing, early_stop)
         pieces.append(torch.cat([head, tail])[:count])
     if screen_gradient is not None and rgb.requires_grad:
         seen, radius = rgb.grad_fn.seen, rgb.grad_fn.radius
@@ -138,9 +134,7 @@ def _draw(
 
     order, scratch, offsets = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n + 1, np.int64)
     starts = np.empty(columns * rows + 1, np.int64)
-    visible, total = sort_and_offset(
-        _BUILD, segments, record, stride, histogram, order, scratch, offsets, starts
-    )
+    visible, total = sort_and_offset(_BUILD, segments, record, stride, histogram, order, scratch, offsets, starts)
     items, slots, shapes = (np.empty(total, np.int32) for _ in range(3))
     lists = (record, stride, offsets, starts, columns, items, slots, shapes)
     parallel(fill_lists, threads, _BUILD, visible, order, boxes, *lists)
@@ -184,9 +178,7 @@ def _undraw(state: _State, geometry: list[np.ndarray], g_image: list[np.ndarray]
     tickets = np.zeros(1, np.int64)
     work = (s.tiles, camera.width, camera.height, s.record, s.record_stride, s.items, s.slots, s.shapes)
     images = (s.image.reshape(-1), tuple(g.reshape(-1) for g in g_image))
-    parallel(
-        unblend, s.threads, s.build, tickets, *work, s.starts, s.stops, s.floor, *images, partial, stride
-    )
+    parallel(unblend, s.threads, s.build, tickets, *work, s.starts, s.stops, s.floor, *images, partial, stride)
     shapes = [(n, 3), (n, 4), (n, 3), (n,), (n, 3), (n, count), (n, 2)]
     grads = [np.empty(shape, np.float32) for shape in shapes]
     flat = [a.reshape(-1) for a in geometry]
@@ -201,9 +193,7 @@ def _numpy(tensor: Tensor) -> np.ndarray:
 
 class _Draw(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx, means, quats, scales, opacities, colors, channels, shift, camera, background, early_stop
-    ):
+    def forward(ctx, means, quats, scales, opacities, colors, channels, shift, camera, background, early_stop):
         geometry = (means, quats, scales, opacities)
         arrays = [_numpy(t) for t in geometry]
         state, seen = _draw(arrays, _numpy(colors), _numpy(channels), camera, _numpy(background), early_stop)

@@ -55,9 +55,7 @@ def tangent_limits(camera: Camera) -> tuple[float, float, float, float]:
     )
 
 
-def _project(
-    centres: Tensor, quats: Tensor, scales: Tensor, R: Tensor, camera: Camera
-) -> tuple[Tensor, Tensor]:
+def _project(centres: Tensor, quats: Tensor, scales: Tensor, R: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """Camera-frame centres (n, 3) and shapes to pixel means (n, 2) and pixel covariances (n, 2, 2)."""
     x, y, z = centres.unbind(1)
     x_min, x_max, y_min, y_max = tangent_limits(camera)

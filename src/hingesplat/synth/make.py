@@ -45,9 +45,7 @@ def make(
     if name not in MAKERS:
         raise HingesplatError(f"{name}: no such object; there are {', '.join(NAMES)}")
     if size < 16 or train_views < 1 or test_views < 0:
-        raise HingesplatError(
-            f"size {size}, views {train_views} + {test_views}: need ≥ 16 pixels and ≥ 1 view"
-        )
+        raise HingesplatError(f"size {size}, views {train_views} + {test_views}: need ≥ 16 pixels and ≥ 1 view")
     out = Path(out)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise HingesplatError(f"{out}: is already there; name another folder, or delete it first")

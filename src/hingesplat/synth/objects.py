@@ -59,9 +59,7 @@ class Model:
         return self.poses({b.name: b.hinge.states[index] for b in self.bodies if b.hinge})
 
 
-def _states(
-    rng: np.random.Generator, low: tuple[float, float], high: tuple[float, float]
-) -> tuple[float, float]:
+def _states(rng: np.random.Generator, low: tuple[float, float], high: tuple[float, float]) -> tuple[float, float]:
     """A nearly closed and an open value; one object in four is photographed open first."""
     a, b = rng.uniform(*low), rng.uniform(*high)
     return (b, a) if rng.random() < 0.25 else (a, b)
@@ -92,9 +90,7 @@ def cabinet(seed: int) -> Model:
     s = int(rng.integers(1 << 20))
     side, level = wood(light, dark, 2, s), wood(light, dark, 0, s + 40)
     inside = checker(_colour(rng, (0.8, 0.95), 0.25), _colour(rng, (0.5, 0.65), 0.35), 0.045, s + 80)
-    back = by_face(
-        speckle(_colour(rng, (0.6, 0.8), 0.3), _colour(rng, (0.3, 0.45), 0.4), 0.02, s + 120), f2=inside
-    )
+    back = by_face(speckle(_colour(rng, (0.6, 0.8), 0.3), _colour(rng, (0.3, 0.45), 0.4), 0.02, s + 120), f2=inside)
     carcass = (
         box((-w, -d, 0), (-w + wall, d, H), side),
         box((w - wall, -d, 0), (w, d, H), side),
@@ -144,9 +140,7 @@ def cabinet(seed: int) -> Model:
         "cabinet",
         (
             Body("base", carcass),
-            Body(
-                "door", door, Hinge("base", "revolute", (0, 0, sign), (sign * w, front, 0), (0.0, 1.9), swing)
-            ),
+            Body("door", door, Hinge("base", "revolute", (0, 0, sign), (sign * w, front, 0), (0.0, 1.9), swing)),
             Body(
                 "drawer",
                 drawer,
@@ -176,9 +170,7 @@ def laptop(seed: int) -> Model:
     W, D, T = rng.uniform(0.33, 0.37), rng.uniform(0.23, 0.26), rng.uniform(0.018, 0.022)
     w, lid, gap = W / 2, rng.uniform(0.010, 0.013), 0.005
     s = int(rng.integers(1 << 20))
-    shell = speckle(
-        _colour(rng, (0.7, 0.85), 0.15), _colour(rng, (0.35, 0.5), 0.3), rng.uniform(0.010, 0.015), s
-    )
+    shell = speckle(_colour(rng, (0.7, 0.85), 0.15), _colour(rng, (0.35, 0.5), 0.3), rng.uniform(0.010, 0.015), s)
     deck = wood(_colour(rng, (0.7, 0.9), 0.3), _colour(rng, (0.35, 0.5), 0.4), 0, s + 40, 0.02)
     pad = checker(_colour(rng, (0.6, 0.8), 0.3), _colour(rng, (0.4, 0.5), 0.3), 0.012, s + 80)
     solids = [box((-w, -D / 2, 0), (w, D / 2, T), by_face(shell, f5=deck))]

@@ -29,9 +29,7 @@ class Patch:
     def mesh(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Vertices (n, 3), their (s, t) (n, 2), and triangles (m, 3)."""
         a, b = self.cells
-        s, t = np.meshgrid(
-            np.linspace(0, self.size[0], a + 1), np.linspace(0, self.size[1], b + 1), indexing="ij"
-        )
+        s, t = np.meshgrid(np.linspace(0, self.size[0], a + 1), np.linspace(0, self.size[1], b + 1), indexing="ij")
         st = np.stack([s.ravel(), t.ravel()], 1)
         i = np.arange((a + 1) * (b + 1)).reshape(a + 1, b + 1)
         p00, p10, p11, p01 = (q.ravel() for q in (i[:-1, :-1], i[1:, :-1], i[1:, 1:], i[:-1, 1:]))
@@ -67,9 +65,7 @@ def solid_mesh(solid: Solid) -> trimesh.Trimesh:
 def _rectangle(corner: np.ndarray, u: np.ndarray, v: np.ndarray, texture: Texture, face: int) -> Patch:
     length_u, length_v = float(np.linalg.norm(u)), float(np.linalg.norm(v))
     du, dv = u / length_u, v / length_v
-    return Patch(
-        lambda s, t: corner + s[:, None] * du + t[:, None] * dv, (length_u, length_v), (1, 1), texture, face
-    )
+    return Patch(lambda s, t: corner + s[:, None] * du + t[:, None] * dv, (length_u, length_v), (1, 1), texture, face)
 
 
 def box(low: tuple[float, float, float], high: tuple[float, float, float], texture: Texture) -> Solid:

@@ -63,9 +63,7 @@ class Surface:
                 shape = (max(2, round(patch.size[0] / texel)), max(2, round(patch.size[1] / texel)))
                 light_shape = (-(-shape[0] // LIGHT_STEP), -(-shape[1] // LIGHT_STEP))
                 s, t = _grid(patch, light_shape)
-                self.texels.append(
-                    Texels(body.name, shape, offset, light_shape, patch.at(s, t), patch.normals(s, t))
-                )
+                self.texels.append(Texels(body.name, shape, offset, light_shape, patch.at(s, t), patch.normals(s, t)))
                 albedo.append(patch.texture(patch.at(*_grid(patch, shape)), patch.face))
                 vertices.append(v)
                 coords.append(st / np.asarray(patch.size) * shape)
@@ -123,9 +121,7 @@ class LitScene:
         start = 0
         for texels in self.surface.texels:
             a, b = texels.light_shape
-            coarse = gaussian_filter(
-                light[start : start + a * b].reshape(a, b, 3), (0.6, 0.6, 0), mode="nearest"
-            )
+            coarse = gaussian_filter(light[start : start + a * b].reshape(a, b, 3), (0.6, 0.6, 0), mode="nearest")
             h, w = texels.shape
             fine = np.asarray(zoom(coarse, (h / a, w / b, 1), order=1, mode="nearest", grid_mode=True))
             out[texels.offset : texels.offset + h * w] = fine.reshape(-1, 3)
