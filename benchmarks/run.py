@@ -1,4 +1,4 @@
-"""Measure everything: the demo, the rasteriser, and captures where a folder of them is given.
+"""Measure everything: the rasteriser, the demo, and captures where a folder of them is given.
 
     python benchmarks/run.py [--captures DIR] [--seeds 0 1 2] [--readme README.md]
 
@@ -15,17 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import bench_rasteriser
 import torch
 import tyro
 from captures import Options as CaptureOptions
 from captures import by_capture, call, cells, measure_all, results, save
 from rich.console import Console
-
-from hingesplat import cli
-from hingesplat.camera import Camera
-from hingesplat.gaussians import Gaussians
-from hingesplat.render import render
 
 START, END = "<!-- results -->", "<!-- /results -->"
 LEFT_OUT = ("fit s", "segment s", "joint s", "rest s")
@@ -55,55 +50,21 @@ def demo() -> list[dict[str, Any]]:
     return rows
 
 
-def rasteriser(n: int = 10_000, size: int = 400, repeats: int = 10) -> dict[str, float]:
-    """Milliseconds of a picture of n random Gaussians, and of one with its gradients; best of ``repeats``."""
-    generator = torch.Generator().manual_seed(0)
-    ball = torch.nn.functional.normalize(torch.randn((n, 3), generator=generator), dim=1) * 0.5
-    gaussians = Gaussians(
-        means=ball,
-        quats=torch.randn((n, 4), generator=generator),
-        log_scales=torch.full((n, 3), float(np.log(0.01))),
-        logit_opacities=torch.full((n,), 2.0),
-        sh=torch.randn((n, 1, 3), generator=generator),
-        part=torch.zeros(n, dtype=torch.int64),
-    )
-    pose = np.eye(4)
-    pose[2, 3] = -2
-    camera = Camera(pose, 1.2 * size, 1.2 * size, size / 2, size / 2, size, size)
-    gaussians.means.requires_grad_()
-    gaussians.sh.requires_grad_()
-    forward, both = [], []
-    for _ in range(repeats + 1):  # The first one compiles.
-        started = time.perf_counter()
-        picture = render(gaussians, camera, backend="numba").rgb
-        forward.append(time.perf_counter() - started)
-        picture.square().mean().backward()
-        both.append(time.perf_counter() - started)
-    return {
-        "gaussians": n,
-        "size": size,
-        "forward_ms": round(1000 * min(forward[1:]), 2),
-        "forward_backward_ms": round(1000 * min(both[1:]), 2),
-    }
-
-
-def markdown(rows: Sequence[dict[str, Any]], raster: dict[str, float]) -> str:
+def markdown(rows: Sequence[dict[str, Any]]) -> str:
     """The table for the README with what stands around it."""
     groups = by_capture(rows)
     lines = [cells(group) for group in groups]
     head = [title for title in max(lines, key=len) if title not in LEFT_OUT]
     table = ["| " + " | ".join([*head, "given"]) + " |", "|---" * (len(head) + 1) + "|"]
     for line, group in zip(lines, groups, strict=True):
-        given = next((r["summary"]["given"] for r in group if "summary" in r), {})
-        told = ", ".join(k for k, v in given.items() if v) or "nothing"
+        given = next((r["summary"]["given"] for r in group if "summary" in r), None)
+        told = "" if given is None else ", ".join(k for k, v in given.items() if v) or "nothing"
         table.append("| " + " | ".join([*(line.get(title, "") for title in head), told]) + " |")
     seeds = sorted({r["summary"]["seed"] for r in rows if "summary" in r})
     notes = (
         "Axis, position and motion are those of a capture's worst joint; one that was not found counts 90°.",
         f"Seeds: {', '.join(map(str, seeds)) or '–'}; ± is the standard deviation over them.",
         f"Machine: {machine()}.",
-        f"Rasteriser, {raster['gaussians']} Gaussians at {raster['size']}×{raster['size']} pixels:",
-        f"{raster['forward_ms']:.1f} ms a picture, {raster['forward_backward_ms']:.1f} ms with gradients.",
     )
     return "\n".join([*table, "", *notes])
 
@@ -127,10 +88,7 @@ def set_table(readme: Path, table: str) -> None:
 def main() -> None:
     options = tyro.cli(Options, description=__doc__)
     console = Console()
-    cli.use_all_cores()
-    raster = rasteriser()
-    save("rasteriser", raster | {"machine": machine()})
-    console.print(raster)
+    bench_rasteriser.main()
     rows = demo()
     save("demo", rows)
     rows = rows[-1:]
@@ -138,7 +96,7 @@ def main() -> None:
         more = measure_all(CaptureOptions(options.captures, seeds=options.seeds), console)
         save("captures", more)
         rows += more
-    table = markdown(rows, raster)
+    table = markdown(rows)
     console.print(table, soft_wrap=True, markup=False)
     if options.readme is not None:
         set_table(options.readme, table)

@@ -146,7 +146,7 @@ def test_joints_and_paths_are_shown_at_the_end(stage, capture: Path, tmp_path: P
     monkeypatch.setenv("COLUMNS", "160")
     assert run_toy(capture, tmp_path / "run") == 0
     out, err = capfd.readouterr()
-    for text in ("part_1", "revolute", "0.000 0.000 1.000", "0.0° … 57.3°", "0.93", "twin.json"):
+    for text in ("part_1", "revolute", "0.000 0.000 1.000", "0.0 … 57.3°", "0.93", "twin.json"):
         assert text in out, text
     assert err == ""
     assert run_toy(capture, tmp_path / "run", "--quiet") == 0

@@ -24,7 +24,7 @@ from hingesplat.twin import Part, Twin
 
 @pytest.fixture(scope="module")
 def cabinet(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make("cabinet", tmp_path_factory.mktemp("made") / "cabinet", size=96, train_views=24, test_views=3)
+    return make("cabinet", tmp_path_factory.mktemp("made") / "cabinet", size=128, train_views=30, test_views=3)
 
 
 @pytest.fixture(scope="module")
@@ -141,6 +141,25 @@ def test_a_folder_that_is_no_run_is_left_alone(toy: Toy, capture: Capture, tmp_p
     assert toy.calls == []
 
 
+def test_stages_add_up_in_one_order(toy: Toy, capture: Capture, monkeypatch, tmp_path: Path) -> None:
+    """On two threads, the gradient of an indexed tensor is else another one each time."""
+    sums = []
+
+    def stage(run: Run) -> None:
+        generator = torch.Generator().manual_seed(0)
+        weight = torch.randn((100_000, 3), generator=generator)
+        index = torch.randint(0, 3, (100_000,), generator=generator)
+        for _ in range(8):
+            table = torch.zeros((3, 3), requires_grad=True)
+            (table[index] * weight).sum().backward()
+            sums.append(table.grad)
+
+    monkeypatch.setitem(pipeline.STAGES, "second", stage)
+    reconstruct(capture, out=tmp_path / "run")
+    assert all(torch.equal(s, sums[0]) for s in sums)
+    assert not torch.are_deterministic_algorithms_enabled()
+
+
 def test_max_size_caps_the_photographs(toy: Toy, capture: Capture, monkeypatch, tmp_path: Path) -> None:
     seen = []
     monkeypatch.setitem(pipeline.STAGES, "second", lambda run: seen.extend(v.camera.width for v in run.views[0]))
@@ -208,7 +227,7 @@ def test_depth_points_lie_on_what_the_depth_shows(cabinet: Path) -> None:
         uv, z = view.camera.project(points)
         u, v = np.floor(uv).astype(int).T
         assert view.depth is not None
-        there = view.depth[v.clip(0, 95), u.clip(0, 95)]
+        there = view.depth[v.clip(0, 127), u.clip(0, 127)]
         assert np.mean(z > there - 0.05) > 0.9  # On the surface or behind it, not in front.
     assert pipeline.depth_points(load_capture(cabinet).states[0].train, 500, seed=0) is None
 
@@ -217,9 +236,9 @@ def small_config() -> ReconstructConfig:
     config = ReconstructConfig()
     return replace(
         config,
-        fit=replace(config.fit, steps=500, start_gaussians=2000, max_gaussians=3500),
-        articulate=replace(config.articulate, steps=300),
-        joints=replace(config.joints, steps=100, type_steps=30, uncertainty_views=4),
+        fit=replace(config.fit, steps=600, start_gaussians=2500, max_gaussians=4500),
+        articulate=replace(config.articulate, steps=1000),
+        joints=replace(config.joints, steps=150, uncertainty_views=4),
         mesh=replace(config.mesh, views=12, image_size=96, resolution=48),
     )
 
@@ -240,12 +259,12 @@ def test_identical_states_give_a_static_twin(cabinet: Path, tmp_path: Path) -> N
 
 
 def test_a_door_and_a_drawer_from_photographs_alone(cabinet: Path, capture: Capture, tmp_path: Path) -> None:
-    """Neither the number of parts nor the types of joints are told. The bounds are loose: 96 pixels."""
+    """Neither the number of parts nor the types of joints are told. The bounds are loose: 128 pixels."""
     run = tmp_path / "run"
     twin = reconstruct(capture, small_config(), out=run)
     assert sorted(j.type for j in twin.joints) == ["prismatic", "revolute"]
     config = json.loads((run / "config.json").read_text())
-    assert config["capture"] == str(cabinet) and config["fit"]["steps"] == 500
+    assert config["capture"] == str(cabinet) and config["fit"]["steps"] == 600
     metrics = evaluate(run, cabinet)
     assert metrics["parts_found"] == metrics["parts_true"] == 3
     for joint in metrics["joints"]:

@@ -26,6 +26,7 @@ import hingesplat
 from hingesplat.errors import HingesplatError
 
 if TYPE_CHECKING:
+    from hingesplat.pipeline import ReconstructConfig
     from hingesplat.twin import Twin
 
 INTERRUPTED, BAD_INPUT, BUG = 130, 2, 1
@@ -326,23 +327,22 @@ def show_joints(console: Console, twin: "Twin") -> None:
         return
     names = {part.id: part.name for part in twin.parts}
     table = Table(title="Joints found", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for title in ("part", "type", "axis", "pivot", "range", "conf."):
-        table.add_column(title, no_wrap=title != "part")
+    for title in ("part", "type", "axis", "pivot", "range", "conf"):
+        table.add_column(title, no_wrap=title != "pivot")
     for j in twin.joints:
         turns = j.type == "revolute"
         low, high = (degrees(v) if turns else v for v in j.limits)
         table.add_row(
-            names[j.child] + (f" on {names[j.parent]}" if j.parent else ""),
+            names[j.child],
             j.type,
             _vector(j.axis, 3),
             _vector(j.pivot, 2) if turns else "",
-            f"{low:.1f}° … {high:.1f}°" if turns else f"{low:.3f} … {high:.3f}",
+            f"{low:.1f} … {high:.1f}°" if turns else f"{low:.3f} … {high:.3f}",
             "" if j.confidence is None else f"{j.confidence:.2f}",
         )
     console.print(table)
     for j in twin.joints:
-        if j.verdict:
-            console.print(f"{names[j.child]}: {escape(j.verdict)}", soft_wrap=True)
+        console.print(f"{names[j.child]} on {names[j.parent]}: {escape(j.verdict)}", soft_wrap=True)
 
 
 def show_metrics(console: Console, metrics: dict[str, Any]) -> None:

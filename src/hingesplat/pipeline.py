@@ -164,7 +164,7 @@ def reconstruct(
     _open(folder, capture, config, overwrite)
     run = Run(folder, capture, config, report)
     try:
-        with _log_file(folder / "log.txt"):
+        with _log_file(folder / "log.txt"), _repeatable():
             log.info("%s to %s", capture.path, folder)
             _run_stages(run)
     finally:
@@ -561,6 +561,17 @@ def _read_json(path: Path) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise HingesplatError(f"{path}: must hold a JSON object; give another folder")
     return data
+
+
+@contextmanager
+def _repeatable() -> Iterator[None]:
+    """Torch's threads add up gradients of indexed tensors in one order: the same seed gives the same joints."""
+    before = torch.are_deterministic_algorithms_enabled()
+    torch.use_deterministic_algorithms(not torch.cuda.is_available())
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(before)
 
 
 class _LogFile(logging.FileHandler):

@@ -22,6 +22,12 @@ from hingesplat.screw import matrix_to_screw
 from hingesplat.search import Motion, ScoreVolume, scan, score_volume
 from hingesplat.visibility import COLOUR, FREE, HIDDEN, SURFACE, Sight, ask, look
 
+Labels = tuple[np.ndarray, np.ndarray]
+"""Part id of every surface point of the two states."""
+
+LARGE_PIECE = 0.2
+"""A piece this large beside the largest of its part is a part of its own, not a fragment."""
+
 HIDDEN_SEED_COST = 0.5
 """Cost of a seed that a motion takes out of everybody's sight."""
 
@@ -226,44 +232,41 @@ def refine_motion(
 
 
 def label_costs(
-    surface: Surface, other: Sight, motions: Sequence[Motion], *, forward: bool, hidden_cost: float = 0.25
+    surface: Surface, other: Sight, transforms: Sequence[np.ndarray], *, hidden_cost: float = 0.25
 ) -> np.ndarray:
-    """(n, 1 + motions) cost of each label for each surface point, from the other state's photographs alone."""
+    """(n, 1 + transforms) cost of each label for each surface point, from the other state's photographs alone.
+
+    Label 0 is to stay; label k + 1 is to move by ``transforms[k]``, 4×4 from the surface's state to the other.
+    """
     columns = []
-    for motion in [None, *motions]:
-        points, travel = surface.points, 0.0
-        if motion is not None:
-            points = moved(points, motion.T if forward else np.linalg.inv(motion.T))
-            travel = np.linalg.norm(points - surface.points, axis=1)
+    for T in [None, *transforms]:
+        points = surface.points if T is None else moved(surface.points, T)
         answer = ask(points, surface.colours, other)
         views = np.maximum(answer[:, : HIDDEN + 1].sum(1), 1)
         free, seen, hidden = answer[:, FREE] / views, answer[:, SURFACE] / views, answer[:, HIDDEN] / views
         contradiction = np.clip(free / 0.25, 0, 1)
         colour = np.clip((answer[:, COLOUR] - 0.05) / 0.5, 0, 1) * seen / np.maximum(seen + hidden, 1e-6)
-        columns.append(
-            contradiction + 0.5 * colour + hidden_cost * hidden + (0.0 if motion is None else 0.1 + 0.1 * travel)
-        )
+        # To move is a claim: it costs a little, and more the farther it goes.
+        claim = 0.0 if T is None else 0.1 + 0.1 * np.linalg.norm(points - surface.points, axis=1)
+        columns.append(contradiction + 0.5 * colour + hidden_cost * hidden + claim)
     return np.stack(columns, 1)
 
 
-def seed_costs(seeds: Surface, other: Sight, motions: Sequence[Motion], *, forward: bool) -> np.ndarray:
-    """(n, motions) cost of each motion for each seed. Here hidden is worse than seen: a seed must go somewhere."""
-    return label_costs(seeds, other, motions, forward=forward, hidden_cost=HIDDEN_SEED_COST)[:, 1:]
+def seed_costs(seeds: Surface, other: Sight, transforms: Sequence[np.ndarray]) -> np.ndarray:
+    """(n, transforms) cost of each motion for each seed. Here hidden is worse than seen: a seed must go somewhere."""
+    return label_costs(seeds, other, transforms, hidden_cost=HIDDEN_SEED_COST)[:, 1:]
 
 
 def neighbour_weights(points: np.ndarray, colours: np.ndarray, radius: float, k: int = 12) -> csr_matrix:
     """(n, n) sparse weights of the k nearest points, less for distance and for another colour."""
     n = len(points)
     k = min(k, n - 1)
-    distance, index = KDTree(points).query(points, k + 1)
+    distance, index = map(np.asarray, KDTree(points).query(points, k + 1))
     row = np.repeat(np.arange(n), k)
     column = index[:, 1:].ravel()
     difference = np.linalg.norm(colours[row] - colours[column], axis=1)
     weight = np.exp(-((distance[:, 1:].ravel() / radius) ** 2)) * np.exp(-((difference / 0.3) ** 2))
     return csr_matrix((weight, (row, column)), shape=(n, n))
-
-
-Labels = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -282,21 +285,19 @@ class Labelling:
         w0, w1 = (neighbour_weights(s.points, s.colours, 0.025 * extent) for s in surfaces)
         return Labelling(surfaces, (w0, w1), (KDTree(surfaces[0].points), KDTree(surfaces[1].points)), extent)
 
-    def costs(self, motions: Sequence[Motion]) -> list[np.ndarray]:
+    def costs(self, T_1_0: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """``label_costs`` of both states' points."""
         a, b = self.surfaces
-        return [
-            label_costs(a, b.sight, motions, forward=True),
-            label_costs(b, a.sight, motions, forward=False),
-        ]
+        return [label_costs(a, b.sight, T_1_0), label_costs(b, a.sight, [np.linalg.inv(T) for T in T_1_0])]
 
-    def partners(self, motions: Sequence[Motion]) -> list[np.ndarray]:
+    def partners(self, T_1_0: Sequence[np.ndarray]) -> list[np.ndarray]:
         """(n_s, 1 + motions): the other state's point with which each point coincides under each label, or −1."""
         result = []
         for s in (0, 1):
             columns = []
-            for motion in [None, *motions]:
-                T = np.eye(4) if motion is None else motion.T if s == 0 else np.linalg.inv(motion.T)
-                distance, index = map(np.asarray, self.trees[1 - s].query(moved(self.surfaces[s].points, T)))
+            for T in [np.eye(4), *T_1_0]:
+                carried = moved(self.surfaces[s].points, T if s == 0 else np.linalg.inv(T))
+                distance, index = map(np.asarray, self.trees[1 - s].query(carried))
                 columns.append(np.where(distance < 0.025 * self.extent, index, -1))
             result.append(np.stack(columns, 1))
         return result
@@ -326,23 +327,26 @@ class Labelling:
             q = updated
         return (q[0].argmax(1), q[1].argmax(1)), energy
 
-    def solve(self, motions: Sequence[Motion], part_cost: float, parts: int | None) -> tuple[list[Motion], Labels]:
-        """Drop motions one by one as long as doing without costs less than a part; then the labels of the rest."""
-        motions = list(motions)
-        costs, partners = self.costs(motions), self.partners(motions)
-        columns = list(range(len(motions) + 1))
+    def solve(self, T_1_0: Sequence[np.ndarray], part_cost: float, parts: int | None) -> tuple[list[int], Labels]:
+        """Drop motions one by one as long as doing without costs less than a part.
+
+        Returns:
+            The indices of the motions that stay, and labels that count them from 1.
+        """
+        costs, partners = self.costs(T_1_0), self.partners(T_1_0)
+        columns = list(range(len(T_1_0) + 1))
 
         def run(keep: list[int], iterations: int) -> tuple[Labels, float]:
             return self.mean_field([c[:, keep] for c in costs], [p[:, keep] for p in partners], iterations)
 
-        while len(columns) > 1:
+        while len(columns) > 1 and len(columns) - 1 != parts:
             energy = run(columns, 8)[1]
             trials = {k: run([c for c in columns if c != k], 8)[1] for k in columns[1:]}
             worst = min(trials, key=lambda k: trials[k])
-            if (parts is None and trials[worst] - energy > part_cost) or len(columns) - 1 == parts:
+            if parts is None and trials[worst] - energy > part_cost:
                 break
             columns.remove(worst)
-        return [motions[k - 1] for k in columns[1:]], run(columns, 20)[0]
+        return [k - 1 for k in columns[1:]], run(columns, 20)[0]
 
 
 def softmax(x: np.ndarray) -> np.ndarray:
@@ -390,8 +394,8 @@ def segment(
 
     def costs_of(candidates: Sequence[Motion]) -> np.ndarray:
         """(seeds, candidates) what the other state's cameras say of every seed under every candidate."""
-        pairs = ((judges[0], sights[1], True), (judges[1], sights[0], False))
-        return np.concatenate([seed_costs(j, o, candidates, forward=f) for j, o, f in pairs])
+        forward, backward = [m.T for m in candidates], [inverted(m).T for m in candidates]
+        return np.concatenate([seed_costs(judges[0], sights[1], forward), seed_costs(judges[1], sights[0], backward)])
 
     costs = costs_of(pool)
     pool += consensus(pool, costs, surfaces, [i[: config.max_seeds] for i in seeds], fine, extent, config, rng)
@@ -410,8 +414,10 @@ def segment(
                 owned if round_ else None,
             )
         ]
-        chosen, owned = problem.solve(chosen, config.part_cost * 2, parts)
+        kept, owned = problem.solve([m.T for m in chosen], config.part_cost * 2, parts)
+        chosen = [chosen[k] for k in kept]
     chosen, owned = split_pieces(chosen, owned, surfaces, extent, config)
+    owned = reattach_fragments([m.T for m in chosen], owned, surfaces, extent)
     costs = costs_of(chosen) if chosen else np.ones((1, 1))
     unexplained = float((costs.min(1) >= config.explained_cost).mean())
     labels = tuple(spread_labels(gaussians[s].means.numpy(), surfaces[s], owned[s]) for s in (0, 1))
@@ -423,7 +429,7 @@ def _owners(
     costs: np.ndarray,
     seeds: Sequence[np.ndarray],
     config: SegmentConfig,
-    owned: "Labels | None",
+    owned: Labels | None,
 ) -> list[tuple[Motion, tuple[np.ndarray, np.ndarray]]]:
     """Each motion with the points of both states to refine it on: its labelled points, or at first its seeds."""
     if owned is not None:
@@ -437,35 +443,84 @@ def _owners(
 
 def split_pieces(
     motions: Sequence[Motion],
-    owned: "Labels",
+    owned: Labels,
     surfaces: tuple[Surface, Surface],
     extent: float,
     config: SegmentConfig,
-) -> tuple[list[Motion], "Labels"]:
+) -> tuple[list[Motion], Labels]:
     """One part is one piece: two large pieces far apart that share a motion become two parts with that motion.
 
     Two doors one above the other, turned by the same angle about the same line, are such a pair.
     """
     result: list[Motion] = []
-    labels = tuple(np.zeros_like(o) for o in owned)
+    labels = (np.zeros_like(owned[0]), np.zeros_like(owned[1]))
     for k, motion in enumerate(motions):
-        rows = [np.flatnonzero(o == k + 1) for o in owned]
-        both = np.concatenate([moved(surfaces[0].points[rows[0]], motion.T), surfaces[1].points[rows[1]]])
-        piece = components(both, 0.025 * extent)
-        size = np.bincount(piece, minlength=1)
-        large = np.flatnonzero(size >= max(0.2 * size.max(), 3 * config.min_part_seeds))
-        if len(large) == 0:
-            continue
-        centres = np.stack([both[piece == p].mean(0) for p in large])
-        tree = [KDTree(both[piece == p]) for p in large]
-        distance = np.stack([t.query(both)[0] for t in tree], 1)
-        nearest = distance.argmin(1)
-        split = np.split(nearest, [len(rows[0])])
-        for p in range(len(centres)):
+        rows, piece = _pieces(k + 1, motion.T, owned, surfaces, extent)
+        size = np.bincount(np.concatenate(piece), minlength=1)
+        for p in np.flatnonzero(size >= max(LARGE_PIECE * size.max(), 3 * config.min_part_seeds)):
             result.append(motion)
             for s in (0, 1):
-                labels[s][rows[s][split[s] == p]] = len(result)
-    return result, (labels[0], labels[1])
+                labels[s][rows[s][piece[s] == p]] = len(result)
+        for s in (0, 1):
+            # Small pieces stay with their motion for now; ``reattach_fragments`` judges them.
+            lost = rows[s][labels[s][rows[s]] == 0]
+            found = rows[s][labels[s][rows[s]] > 0]
+            if len(lost) and len(found):
+                points = surfaces[s].points
+                labels[s][lost] = labels[s][found][KDTree(points[found]).query(points[lost])[1]]
+    return result, labels
+
+
+def reattach_fragments(
+    T_1_0: Sequence[np.ndarray], owned: Labels, surfaces: tuple[Surface, Surface], extent: float
+) -> Labels:
+    """Small pieces apart from their part's main one go to whatever they touch: nothing floats in the air."""
+    stray = (np.zeros(len(owned[0]), bool), np.zeros(len(owned[1]), bool))
+    for k, T in enumerate([np.eye(4), *T_1_0]):
+        rows, piece = _pieces(k, T, owned, surfaces, extent)
+        size = np.bincount(np.concatenate(piece), minlength=1)
+        small = size < (LARGE_PIECE if k else 0.02) * size.max()
+        for s in (0, 1):
+            stray[s][rows[s][small[piece[s]]]] = True
+    labels = (owned[0].copy(), owned[1].copy())
+    for s in (0, 1):
+        if stray[s].any() and not stray[s].all():
+            points = surfaces[s].points
+            nearest = KDTree(points[~stray[s]]).query(points[stray[s]])[1]
+            labels[s][stray[s]] = owned[s][~stray[s]][nearest]
+    return labels
+
+
+def _pieces(
+    label: int, T_1_0: np.ndarray, owned: Labels, surfaces: tuple[Surface, Surface], extent: float
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Rows of one part's points in each state, and the connected piece of each, both states laid over each other."""
+    rows = [np.flatnonzero(o == label) for o in owned]
+    both = np.concatenate([moved(surfaces[0].points[rows[0]], T_1_0), surfaces[1].points[rows[1]]])
+    piece = components(both, 0.025 * extent)
+    return rows, np.split(piece, [len(rows[0])])
+
+
+def relabel(
+    gaussians: tuple[Gaussians, Gaussians],
+    views: tuple[Sequence[View], Sequence[View]],
+    T_1_0: Sequence[np.ndarray],
+    config: SegmentConfig,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Labels of both states' Gaussians once more, for motions (4×4 each) that are known well by now.
+
+    Near a hinge nothing moves far, so a label there is only as good as the motion.
+    """
+    low, high = bounds([g.means.numpy() for g in gaussians])
+    extent = float((high - low).max())
+    sights = [look(g, v, config.sight_size, config.tolerance * extent) for g, v in zip(gaussians, views, strict=True)]
+    surfaces = (on_surface(gaussians[0], sights[0]), on_surface(gaussians[1], sights[1]))
+    owned = Labelling.of(surfaces, extent).solve(T_1_0, 0.0, len(T_1_0))[1]
+    owned = reattach_fragments(T_1_0, owned, surfaces, extent)
+    return (
+        spread_labels(gaussians[0].means.numpy(), surfaces[0], owned[0]),
+        spread_labels(gaussians[1].means.numpy(), surfaces[1], owned[1]),
+    )
 
 
 def propose(
@@ -561,7 +616,7 @@ def _refit(
 def polished(trials: Sequence[Motion], mine: Surface, other: Surface, extent: float) -> Motion:
     """The best of some motions and their registrations, as the other state's cameras judge them."""
     everyone = [*trials, *(registered(m, mine.sheet, other.sheet, extent) for m in trials)]
-    costs = seed_costs(mine, other.sight, everyone, forward=True)
+    costs = seed_costs(mine, other.sight, [m.T for m in everyone])
     return everyone[int(costs.mean(0).argmin())]
 
 
