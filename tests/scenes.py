@@ -70,7 +70,9 @@ def texture(points: np.ndarray, seed: int) -> np.ndarray:
     return 0.5 + 0.4 * np.tanh(waves.sum(1))
 
 
-def sheet(points: np.ndarray, normals: np.ndarray, colours: np.ndarray, size: float, opacity: float = 0.98) -> Gaussians:
+def sheet(
+    points: np.ndarray, normals: np.ndarray, colours: np.ndarray, size: float, opacity: float = 0.98
+) -> Gaussians:
     """Flat Gaussians on a surface, ``size`` their standard deviation along it; part 0."""
     n = len(points)
     helper = np.eye(3)[np.abs(normals).argmin(1)]

@@ -128,7 +128,7 @@ def articulate(
         view = training[state][index]
         R, t = poses.Rt()
         p = identity.probabilities(optimiser, progress)
-        if fitted and step % 200 == 0 and (config.art_weight or config.vector_weight):
+        if fitted and (not targets or step % 200 == 0) and (config.art_weight or config.vector_weight):
             targets = _match(optimiser.gaussians, poses, fitted, extent)
         means = _moved(optimiser.gaussians, R[state], t[state], p, repel_points, config)
         loss, image = state_loss(
@@ -148,6 +148,7 @@ def articulate(
             grow(optimiser, statistics, config.max_gaussians, config.min_opacity, extent, generator)
             statistics = torch.zeros((len(optimiser), 3))
             identity.stale()
+            targets = []  # Rows have changed places.
         if step % 50 == 0 or step == config.steps - 1:
             report(
                 step=step + 1,

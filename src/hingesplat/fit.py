@@ -148,7 +148,7 @@ def _optimise(
             report(
                 step=step + 1,
                 steps=config.steps,
-                loss=float(loss),
+                loss=float(loss.detach()),
                 psnr=float(psnr(image.detach()[:3], view.image[:3])),
                 gaussians=len(optimiser),
             )
@@ -202,7 +202,7 @@ def _choose_sh_degree(
             trial.step(0.6 + 0.4 * step / steps)
         fitted = trial.gaussians.detached()
         score = mean_psnr(fitted, held_back or training)
-        report(step=steps, steps=steps, loss=float(loss), psnr=score, gaussians=len(fitted))
+        report(step=steps, steps=steps, loss=float(loss.detach()), psnr=score, gaussians=len(fitted))
         if score < best_psnr + (config.sh_gain_db if degree else 0):
             break
         best, best_psnr = fitted, score

@@ -40,7 +40,8 @@ from hingesplat.joints import JointsConfig, find_joints
 from hingesplat.mesh import MeshConfig, mesh_parts
 from hingesplat.pictures import write_motion_gif, write_summary
 from hingesplat.render import render
-from hingesplat.segment import Segmentation, SegmentConfig, segment
+from hingesplat.search import Motion
+from hingesplat.segment import Segmentation, SegmentConfig, segment, track
 from hingesplat.twin import Joint, Part, Twin
 
 log = logging.getLogger(__name__)
@@ -50,6 +51,8 @@ PresetName = Literal["fast", "standard", "paper"]
 
 MAX_UNEXPLAINED = 0.8
 """Share of what moved that no rigid part explains, above which there is no point in going on."""
+NOISE = 10
+"""Seeds, in those of the smallest part, below which nothing need have moved: one state photographed twice had 167."""
 ARTEFACTS = (
     *("config.json", "stages.json", "log.txt", "fit_state*.safetensors", "segmentation.*"),
     *("canonical.safetensors", "articulation.safetensors", "gaussians*.safetensors", "twin.json"),
@@ -239,7 +242,7 @@ def initial_transforms(T_1_0: np.ndarray, states: int) -> np.ndarray:
     """T_state_0 (states, parts, 4, 4) to start from.
 
     ``T_1_0`` (parts, 4, 4) are the motions from the first state to the last, the identity for the base.
-    States between the two start where state 0 is.
+    States between the two are at state 0 until ``track`` has found them.
     """
     T_state_0 = np.tile(np.eye(4), (states, len(T_1_0), 1, 1))
     T_state_0[-1] = T_1_0
@@ -250,11 +253,19 @@ def _articulate(run: Run) -> None:
     canonical = Gaussians.load(run / "canonical.safetensors")
     T_1_0 = load_file(run / "segmentation.safetensors")["T_1_0"].numpy()
     T_state_0 = initial_transforms(T_1_0, len(run.capture.states))
+    fitted = [_fitted(run, t) for t in range(len(T_state_0))]
+    if len(T_1_0) > 1:
+        labels = load_file(run / "segmentation.safetensors")["labels_0"].numpy()
+        motions = [Motion.of(m) for m in _read_json(run / "segmentation.json")["motions"]]
+        for t in range(1, len(T_state_0) - 1):
+            pair, views = (fitted[0], fitted[t]), (run.views[0], run.views[t])
+            T_state_0[t, 1:] = track(pair, views, labels, motions, run.config.segment, seed=run.config.seed)
     if len(T_1_0) == 1:
         moved = Articulation(canonical, T_state_0, torch.zeros(len(T_state_0), len(canonical), 3))
     else:
         config, report = run.config.articulate, run.reporting("articulate")
-        moved = articulate(canonical, T_state_0, run.views, config, seed=run.config.seed, report=report)
+        seed = run.config.seed
+        moved = articulate(canonical, T_state_0, run.views, config, fitted=fitted, seed=seed, report=report)
     extra = {"T_state_0": torch.from_numpy(np.asarray(moved.T_state_0)), "state_sh": moved.state_sh}
     write_tensors(run / "articulation.safetensors", vars(moved.gaussians) | extra)
 
@@ -345,7 +356,7 @@ def _check(config: ReconstructConfig) -> None:
 
 def _check_explained(run: Run, found: Segmentation, last: int) -> None:
     """Nothing moved is a result; something moved but not rigidly is none."""
-    if not found.motions and found.seeds < 2 * run.config.segment.min_part_seeds:
+    if not found.motions and found.seeds < NOISE * run.config.segment.min_part_seeds:
         log.warning("no motion found between state 0 and state %d: the twin will be static", last)
     elif not found.motions or found.unexplained > MAX_UNEXPLAINED:
         share = found.unexplained if found.motions else 1.0

@@ -5,7 +5,9 @@ score volume of the other state (high on surfaces that were not there before, ne
 positions that cross the object. Nothing is matched by appearance alone, so repeating texture cannot mislead it far.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -236,6 +238,12 @@ class Motion:
     """Radians or scene units."""
     score: float
     """Mean score of the seeds, at most 1."""
+
+    @staticmethod
+    def of(known: Mapping[str, Any]) -> "Motion":
+        """From a JSON object of its fields."""
+        lists = {name: np.asarray(known[name], np.float64) for name in ("axis", "pivot")}
+        return Motion(known["kind"], value=known["value"], score=known["score"], **lists)
 
     @property
     def T(self) -> np.ndarray:

@@ -436,6 +436,8 @@ def _owners(
         return [
             (m, (np.flatnonzero(owned[0] == k + 1), np.flatnonzero(owned[1] == k + 1))) for k, m in enumerate(motions)
         ]
+    if not motions:
+        return []
     owner = np.where(costs.min(1) < config.explained_cost, costs.argmin(1), -1)
     first, second = owner[: len(seeds[0])], owner[len(seeds[0]) :]
     return [(m, (seeds[0][first == k], seeds[1][second == k])) for k, m in enumerate(motions)]
@@ -501,26 +503,51 @@ def _pieces(
     return rows, np.split(piece, [len(rows[0])])
 
 
-def relabel(
+def track(
     gaussians: tuple[Gaussians, Gaussians],
     views: tuple[Sequence[View], Sequence[View]],
-    T_1_0: Sequence[np.ndarray],
+    labels: np.ndarray,
+    motions: Sequence[Motion],
     config: SegmentConfig,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Labels of both states' Gaussians once more, for motions (4×4 each) that are known well by now.
+    *,
+    seed: int = 0,
+) -> list[np.ndarray]:
+    """T_t_0 (4×4) of every part in a further state, its joint known from another pair of states.
 
-    Near a hinge nothing moves far, so a label there is only as good as the motion.
+    Args:
+        gaussians: fitted to state 0 and to the further state t.
+        views: the training photographs of the same two states.
+        labels: part id of every Gaussian of state 0.
+        motions: each part's joint, as ``segment`` found it.
     """
+    rng = np.random.default_rng(seed)
     low, high = bounds([g.means.numpy() for g in gaussians])
     extent = float((high - low).max())
     sights = [look(g, v, config.sight_size, config.tolerance * extent) for g, v in zip(gaussians, views, strict=True)]
-    surfaces = (on_surface(gaussians[0], sights[0]), on_surface(gaussians[1], sights[1]))
-    owned = Labelling.of(surfaces, extent).solve(T_1_0, 0.0, len(T_1_0))[1]
-    owned = reattach_fragments(T_1_0, owned, surfaces, extent)
-    return (
-        spread_labels(gaussians[0].means.numpy(), surfaces[0], owned[0]),
-        spread_labels(gaussians[1].means.numpy(), surfaces[1], owned[1]),
-    )
+    here, there = on_surface(gaussians[0], sights[0]), on_surface(gaussians[1], sights[1])
+    volume = score_volume(there.points, there.colours, there.sight, here.sight, low, high, 2 * config.cells)
+    found = []
+    for k, motion in enumerate(motions):
+        own = np.flatnonzero(labels[here.index] == k + 1)
+        if len(own) < config.min_part_seeds:
+            found.append(np.eye(4))
+            continue
+        mine = here.rows(rng.choice(own, min(2 * config.seeds_per_search, len(own)), replace=False))
+        reach = np.radians(150) if motion.kind == "revolute" else extent / 2
+        values = np.linspace(-reach, reach, 201)
+        trials = scan(
+            mine.points,
+            mine.colours,
+            motion.axis[None],
+            volume,
+            kinds=(motion.kind,),
+            values=values,
+            near=motion,
+            keep=6,
+        )
+        best = polished([replace(motion, value=0.0), *trials], mine, there, extent)
+        found.append(best.T)
+    return found
 
 
 def propose(
@@ -643,4 +670,4 @@ def spread_labels(points: np.ndarray, surface: Surface, labels: np.ndarray) -> n
     return spread
 
 
-__all__ = ["SegmentConfig", "Segmentation", "segment"]
+__all__ = ["SegmentConfig", "Segmentation", "segment", "track"]

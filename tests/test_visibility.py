@@ -1,0 +1,99 @@
+"""What one state's photographs say of a point."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hingesplat.gaussians import Gaussians
+from hingesplat.visibility import COLOUR, FREE, HIDDEN, SURFACE, Sight, ask, look
+from scenes import box, cameras_around, look_at, photograph, texture
+
+SIZE = 96
+TOLERANCE = 0.03
+CENTRES = np.vstack([np.diag([0.5, 0.3, 0.4]), -np.diag([0.5, 0.3, 0.4])])
+"""Of the box's faces: where it is seen squarely."""
+
+
+@pytest.fixture(scope="module")
+def solid() -> Gaussians:
+    return box((-0.5, -0.3, -0.4), (0.5, 0.3, 0.4), 0.04, seed=1)
+
+
+@pytest.fixture(scope="module")
+def sight(solid: Gaussians) -> Sight:
+    return look(solid, [photograph(solid, c) for c in cameras_around(16, SIZE)], SIZE, TOLERANCE)
+
+
+def answer(points: np.ndarray, sight: Sight) -> np.ndarray:
+    return ask(points, texture(points, 1), sight)
+
+
+def test_points_on_the_surface_are_seen_or_hidden_not_free(sight: Sight) -> None:
+    a = answer(CENTRES, sight)
+    assert (a[:, FREE] <= 1).all()  # A glancing view may err.
+    assert (a[:, SURFACE] >= 2).all() and (a[:, HIDDEN] >= 2).all()
+    assert (a[:, :3].sum(1) == 16).all()
+
+
+def test_points_in_front_are_free_where_the_face_is_seen(sight: Sight) -> None:
+    on, front = answer(CENTRES, sight), answer(1.4 * CENTRES, sight)
+    assert (front[:, SURFACE] == 0).all()
+    assert (front[:, FREE] >= on[:, SURFACE]).all()
+
+
+def test_points_inside_are_hidden_from_everywhere(sight: Sight) -> None:
+    inside = np.random.default_rng(0).uniform(-0.6, 0.6, (50, 3)) * [0.5, 0.3, 0.4]
+    a = answer(inside, sight)
+    assert (a[:, HIDDEN] == 16).all()
+
+
+def test_points_beside_the_mask_are_free(sight: Sight, solid: Gaussians) -> None:
+    above = np.array([[0.0, 0.0, 0.7], [0.3, 0.1, 0.6]])
+    level = [photograph(solid, look_at(np.array([x, y, 0.0]), SIZE)) for x, y in ((0.0, -3.0), (3.0, 0.0), (-3.0, 0.0))]
+    a = answer(above, look(solid, level, SIZE, TOLERANCE))
+    assert (a[:, FREE] == 3).all() and (a[:, COLOUR] == 0).all()
+    assert (answer(above, sight)[:, FREE] >= 8).all()
+
+
+def test_who_stands_out_of_every_picture_gets_no_answer(solid: Gaussians) -> None:
+    one = photograph(solid, look_at(np.array([0.0, -3.0, 0.0]), SIZE))
+    behind, aside = [0.0, -4.0, 0.0], [4.0, 0.0, 0.0]
+    a = answer(np.array([behind, aside]), look(solid, [one], SIZE, TOLERANCE))
+    assert (a == 0).all()
+
+
+def test_the_right_colour_differs_little_and_a_wrong_one_much(sight: Sight) -> None:
+    right = answer(CENTRES, sight)[:, COLOUR]
+    wrong = ask(CENTRES, 1 - texture(CENTRES, 1), sight)[:, COLOUR]
+    assert right.max() < 0.15
+    assert (wrong > 2 * right).all()
+
+
+def test_a_mask_without_gaussians_is_no_free_space(solid: Gaussians) -> None:
+    """Where the photograph shows the object and the render nothing, depth is unknown, not empty."""
+    cameras = cameras_around(16, SIZE)
+    views = [photograph(solid, c) for c in cameras]
+    half = solid[solid.means[:, 0] < 0]
+    a = answer(np.array([[0.35, -0.3, 0.0], [0.35, 0.3, 0.0]]), look(half, views, SIZE, TOLERANCE))
+    assert (a[:, FREE] <= 2).all()
+
+
+def test_a_floater_beside_the_photographed_object_makes_no_surface(solid: Gaussians) -> None:
+    views = [photograph(solid, c) for c in cameras_around(16, SIZE)]
+    lump = solid[solid.means[:, 0] > 0.49]
+    lump.means = lump.means + lump.means.new_tensor([0.4, 0.0, 0.0])
+    a = answer(lump.means.numpy(), look(lump, views, SIZE, TOLERANCE))
+    assert (a[:, FREE] > a[:, SURFACE]).mean() > 0.9
+
+
+def test_look_keeps_each_cameras_shape_and_shrinks_to_the_size(solid: Gaussians) -> None:
+    tall = replace(look_at(np.array([0.0, -3.0, 0.5]), 64), height=128)
+    views = [photograph(solid, c) for c in (look_at(np.array([0.0, -3.0, 0.5]), 64), tall)]
+    sight = look(solid, views, 64, TOLERANCE)
+    assert sight.depth.shape == (2, 64, 32)  # Both by half, the first with empty rows below.
+    assert (sight.depth[0, 32:] == 0).all() and (sight.rgb[0, 32:] == 1).all()
+    assert (sight.depth[:, :32] > 0).any((1, 2)).all()
+    for P, view in zip(sight.P, views, strict=True):
+        h = CENTRES @ P[:, :3].T + P[:, 3]
+        np.testing.assert_allclose(2 * h[:, :2] / h[:, 2:], view.camera.project(CENTRES)[0], rtol=1e-4)
