@@ -4,12 +4,13 @@ It is a sheet of flat, opaque Gaussians, so that its photographs are exact rende
 last digit. What has to be proved on ray-traced photographs is proved on ``hingesplat.synth``.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal
 
 import numpy as np
+import pytest
 import torch
 
 from hingesplat.camera import Camera
@@ -25,6 +26,15 @@ ANGLE = -0.6
 """Radians: the slab swings open like a door, away from the box."""
 FORWARD = np.array([0.0, -1.0, 0.0])
 SLIDE = 0.25
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """For test files that import it. At these sizes threads mostly wait for each other, more so on a busy machine."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 def look_at(eye: np.ndarray, size: int, target: Iterable[float] = (0.0, 0.0, 0.0)) -> Camera:

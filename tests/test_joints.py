@@ -11,7 +11,15 @@ from torch.autograd import gradcheck
 from hingesplat.joints import JointPoses, JointResult, JointsConfig, closest_joint, find_joints
 from hingesplat.poses import move, part_centres
 from hingesplat.screw import line_distance, prismatic, revolute
-from scenes import ANGLE, AXIS, FORWARD, PIVOT, SLIDE, scene
+from scenes import (
+    ANGLE,
+    AXIS,
+    FORWARD,
+    PIVOT,
+    SLIDE,
+    one_thread,  # noqa: F401
+    scene,
+)
 
 SLANT = np.array([0.48, 0.6, 0.64])
 POINT = np.array([0.3, -0.2, 0.5])

@@ -10,7 +10,15 @@ from hingesplat.screw import prismatic, revolute
 from hingesplat.search import HIDDEN_SCORE, Motion, ScoreVolume, both_signs, novelty, scan, score_volume
 from hingesplat.segment import Surface, bounds, on_surface
 from hingesplat.visibility import look
-from scenes import ANGLE, AXIS, FORWARD, PIVOT, SLIDE, scene
+from scenes import (
+    ANGLE,
+    AXIS,
+    FORWARD,
+    PIVOT,
+    SLIDE,
+    one_thread,  # noqa: F401
+    scene,
+)
 
 CELLS = 40
 

@@ -25,7 +25,6 @@ from hingesplat.segment import (
     on_surface,
     reattach_fragments,
     registered,
-    relabel,
     seed_costs,
     segment,
     select_motions,
@@ -33,9 +32,20 @@ from hingesplat.segment import (
     split_pieces,
     spread_labels,
     thin,
+    track,
 )
 from hingesplat.visibility import FREE, HIDDEN, SURFACE, Sight, ask, look
-from scenes import ANGLE, AXIS, FORWARD, PIVOT, SLIDE, Scene, angle_between, scene
+from scenes import (
+    ANGLE,
+    AXIS,
+    FORWARD,
+    PIVOT,
+    SLIDE,
+    Scene,
+    angle_between,
+    one_thread,  # noqa: F401
+    scene,
+)
 
 CONFIG = SegmentConfig(sight_size=96, cells=28, seeds_per_search=40, max_seeds=400, consensus_motions=6)
 QUICK = replace(CONFIG, seeds_per_search=20, cells=20, rounds=1)
@@ -215,7 +225,7 @@ def test_true_motions_cost_their_own_points_least(turned: tuple[Scene, tuple[Sur
         assert (costs[part == 0].argmin(1) == 0).mean() > 0.8
         assert costs[part == 1].mean(0).argmin() == 1
         judged = seed_costs(surface, other, transforms)[part == 1].mean(0)
-        assert judged[0] < 0.6 * judged[1]
+        assert judged[0] < 0.8 * judged[1]
 
 
 def test_only_what_moved_floats(turned: tuple[Scene, tuple[Surface, Surface], float]) -> None:
@@ -256,6 +266,14 @@ def test_registered_keeps_the_kind_and_the_sign(turned: tuple[Scene, tuple[Surfa
         fitted = registered(start, mine.sheet, slid, extent)
         assert fitted.kind == "prismatic"
         np.testing.assert_allclose(fitted.axis * fitted.value, SLIDE * FORWARD, atol=0.002)
+
+
+def test_registering_a_slide_of_nothing_is_no_error(turned: tuple[Scene, tuple[Surface, Surface], float]) -> None:
+    _, (first, _), extent = turned
+    still = replace(PULL, value=0.0)
+    np.testing.assert_allclose(registered(still, first.sheet, first.sheet, extent).T, np.eye(4), atol=1e-6)
+    few = first.rows(np.arange(5))  # Too few to register at all.
+    np.testing.assert_array_equal(registered(still, few.sheet, first.sheet, extent).T, np.eye(4))
 
 
 def test_pieces_far_apart_become_parts_with_one_motion() -> None:
@@ -335,8 +353,21 @@ def test_the_number_of_parts_can_be_given() -> None:
     assert nothing.motions == () and nothing.unexplained == 1 and nothing.labels[0].max() == 0
 
 
-def test_labels_once_more_for_known_motions() -> None:
-    made = made_scene("revolute")
-    labels = relabel((made.gaussians, made.at(1)), made.views, [made.T_state_0[1, 1]], CONFIG)
-    for found in labels:
-        assert (found == made.gaussians.part.numpy()).mean() > 0.92
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+def test_a_further_state_is_tracked_along_the_known_joint(kind: Literal["revolute", "prismatic"]) -> None:
+    """The joint is known from states that lie closer together than the one asked for, or is turned about."""
+    made = made_scene(kind)
+    known = TURN if kind == "revolute" else PULL
+    labels = made.gaussians.part.numpy()
+    for motion in (replace(known, value=0.4 * known.value), replace(known, axis=-known.axis)):
+        (T,) = track((made.gaussians, made.at(1)), made.views, labels, [motion], CONFIG)
+        assert angle_between(T, made.T_state_0[1, 1]) < 1.0
+        np.testing.assert_allclose(T[:3, 3], made.T_state_0[1, 1, :3, 3], atol=0.01)
+
+
+def test_tracking_a_part_that_stayed_or_has_no_points_gives_the_identity() -> None:
+    made = made_scene("static")
+    labels = made.gaussians.part.numpy()
+    stayed, absent = track((made.gaussians, made.gaussians), made.views, labels, [PULL, PULL], CONFIG)
+    np.testing.assert_allclose(stayed, np.eye(4), atol=1e-3)
+    np.testing.assert_array_equal(absent, np.eye(4))

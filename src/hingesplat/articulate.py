@@ -29,7 +29,7 @@ class ArticulateConfig:
 
     steps: int = 1500
     """Optimiser steps, each on one photograph of one state."""
-    max_gaussians: int = 14_000
+    max_gaussians: int = 16_000
     """Cap on the number of canonical Gaussians."""
     pose_rate: float = 2e-3
     """Adam step of the part poses (radians, extents) at the start; decays to 2 %."""

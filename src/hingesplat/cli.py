@@ -85,7 +85,7 @@ class Demo:
         started = time.perf_counter()
         capture, run = self.out / "capture", self.out / "run"
         if not (capture / "truth" / "meta.json").is_file():
-            Synth("cabinet", capture, size=200, views=50).run(console)
+            Synth("cabinet", capture, size=200, views=60).run(console)
         twin = _reconstruct(load_capture(capture), demo_config(), run, True, console)
         show_joints(console, twin)
         show_metrics(console, evaluate(run, capture / "truth"))
@@ -101,7 +101,7 @@ def demo_config() -> "ReconstructConfig":
     return replace(
         config,
         fit=replace(config.fit, steps=1200, start_gaussians=3000, max_gaussians=8000),
-        articulate=replace(config.articulate, steps=1000, max_gaussians=9000),
+        articulate=replace(config.articulate, steps=1500, max_gaussians=16_000),
         mesh=replace(config.mesh, views=32, image_size=200),
     )
 

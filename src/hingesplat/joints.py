@@ -27,7 +27,7 @@ class JointsConfig:
     """Steps of each type's trial, Gaussians frozen."""
     type_significance: float = 2.0
     """A rotation must beat a slide by this many standard errors, since it has more numbers to fit with."""
-    steps: int = 500
+    steps: int = 400
     """Steps of the constrained refinement, everything together."""
     rate: float = 1e-3
     """Adam step of the joint parameters (radians, extents) at the start; decays to 2 %."""

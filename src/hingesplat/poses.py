@@ -99,7 +99,7 @@ class StateLossConfig:
 
     ssim_weight: float = 0.2
     """Weight of 1 − SSIM; the rest is L1 (paper: 0.2)."""
-    depth_variance_weight: float = 20.0
+    depth_variance_weight: float = 5.0
     """Pulls the weight along each ray to one depth."""
     flatten_weight: float = 0.5
     """Shrinks each Gaussian's thinnest axis."""

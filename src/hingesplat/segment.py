@@ -653,7 +653,9 @@ def registered(motion: Motion, source: Sheet, target: Sheet, extent: float) -> M
     centroid = source.points.mean(0)
     if motion.kind == "prismatic":
         shift = T[:3, :3] @ centroid + T[:3, 3] - centroid
-        value = float(np.linalg.norm(shift)) or 1e-12
+        value = float(np.linalg.norm(shift))
+        if value < 1e-9:  # Nowhere has no direction.
+            return motion
         axis = shift / value
         sign = 1.0 if axis @ motion.axis * motion.value >= 0 else -1.0
         return replace(motion, axis=axis * sign, pivot=centroid, value=value * sign)
