@@ -74,6 +74,7 @@ def measure_all(options: Options, console: Console) -> list[dict[str, Any]]:
             for seed in options.seeds:
                 args = ("--seed", str(seed), "--preset", options.preset)
                 rows.append(measure(capture, runs / f"{capture.name}_{seed}", *args))
+                save("captures", rows)
                 line = cells(rows[-1:])
                 console.print("  ".join(f"{k} {v}" for k, v in line.items()), soft_wrap=True)
     finally:

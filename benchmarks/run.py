@@ -6,6 +6,7 @@ Writes ``benchmarks/results/*.json`` and sets the table between the marks in the
 alone meanwhile.
 """
 
+import json
 import os
 import platform
 import tempfile
@@ -18,8 +19,8 @@ from typing import Any
 import bench_rasteriser
 import torch
 import tyro
+from captures import RESULTS, by_capture, call, cells, measure_all, results, save
 from captures import Options as CaptureOptions
-from captures import by_capture, call, cells, measure_all, results, save
 from rich.console import Console
 
 START, END = "<!-- results -->", "<!-- /results -->"
@@ -96,6 +97,8 @@ def main() -> None:
         more = measure_all(CaptureOptions(options.captures, seeds=options.seeds), console)
         save("captures", more)
         rows += more
+    elif (recorded := RESULTS / "captures.json").is_file():
+        rows += json.loads(recorded.read_text())
     table = markdown(rows)
     console.print(table, soft_wrap=True, markup=False)
     if options.readme is not None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from hingesplat.joints import JointPoses, JointResult, JointsConfig, closest_joint, find_joints
+from hingesplat.joints import JointPoses, JointResult, JointsConfig, _joints, closest_joint, find_joints
 from hingesplat.poses import move, part_centres
 from hingesplat.screw import line_distance, prismatic, revolute
 from scenes import (
@@ -169,6 +169,20 @@ def test_values_start_at_zero_their_largest_is_positive_and_limits_cover_them(ki
     across = np.array(joint.pivot) - centre
     assert abs(across @ np.array(joint.axis)) < 1e-4
     assert np.linalg.norm(joint.axis) == pytest.approx(1, abs=1e-9)
+
+
+def test_a_joint_that_was_refined_backwards_is_turned_round() -> None:
+    """Three states, the farthest at a negative value: the axis turns, and the motion stays what it was."""
+    made = scene("prismatic", 48, 0.1)
+    values = np.array([[0.2], [-0.9]])
+    for kind in ("revolute", "prismatic"):
+        p = JointPoses([kind], SLANT[None], POINT[None], values, 1.0)
+        (joint,) = _joints([kind], p, made.gaussians, np.ones(1), None, np.ones(1, int), 1)
+        np.testing.assert_allclose(joint.states, [0, -0.2, 0.9], atol=1e-6)
+        np.testing.assert_allclose(joint.limits, [-0.2, 0.9], atol=1e-6)
+        for state, value in enumerate([0.0, 0.2, -0.9]):
+            expected = joint_transform(kind, SLANT, POINT, value)
+            np.testing.assert_allclose(joint.transform(joint.states[state]), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["revolute", "prismatic"])

@@ -48,7 +48,7 @@ from scenes import (
 )
 
 CONFIG = SegmentConfig(sight_size=96, cells=28, seeds_per_search=40, max_seeds=400, consensus_motions=6)
-QUICK = replace(CONFIG, seeds_per_search=20, cells=20, rounds=1)
+QUICK = replace(CONFIG, seeds_per_search=12, cells=16, consensus_motions=2, rounds=1)
 TURN = Motion("revolute", AXIS, PIVOT, ANGLE, 1.0)
 PULL = Motion("prismatic", FORWARD, np.zeros(3), SLIDE, 1.0)
 NO_SIGHT = Sight(

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
+from scipy.ndimage import convolve
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -76,7 +77,11 @@ def hull_shell(views: Sequence[View], n: int, rng: np.random.Generator) -> tuple
     """n points in the outer voxels of the visual hull, and the object's extent (longest side)."""
     points, voxel = visual_hull(views, 96)
     extent = float((points.max(0) - points.min(0)).max())
-    neighbours = KDTree(points).query_ball_point(points, 2.5 * voxel, return_length=True)
+    cell = np.round((points - points.min(0)) / voxel).astype(int)
+    occupied = np.zeros(cell.max(0) + 1, np.int16)
+    occupied[tuple(cell.T)] = 1
+    ball = (np.square(np.indices((5, 5, 5)) - 2).sum(0) <= 2.5**2).astype(np.int16)
+    neighbours = convolve(occupied, ball, mode="constant")[tuple(cell.T)]
     weight = np.where(neighbours < 0.85 * neighbours.max(), 1.0, 0.15)
     chosen = rng.choice(len(points), n, replace=len(points) < n, p=weight / weight.sum())
     return points[chosen] + rng.uniform(-0.5, 0.5, (n, 3)) * voxel, extent
@@ -185,7 +190,7 @@ def _choose_sh_degree(
     report: Report,
 ) -> Gaussians:
     """Refine with each degree in turn; keep the smallest that held-back views do not improve on by much."""
-    steps = config.steps // 6
+    steps = max(config.steps // 6, 1)
     base = optimiser.gaussians.detached()
     best, best_psnr = base, -math.inf
     for degree in range(config.max_sh_degree + 1) if held_back else [0]:

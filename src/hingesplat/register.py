@@ -53,7 +53,6 @@ def register(
     for i in range(iterations):
         radius = extent * start_radius * (end_radius / start_radius) ** (i / max(iterations - 1, 1))
         moved = source.points @ T[:3, :3].T + T[:3, 3]
-        # Colours shift with the light: compare them less their median difference over the pairs.
         query = np.concatenate([moved, source.colours * colour_length * extent], 1)
         distance, index = map(np.asarray, tree.query(query))
         near = distance < radius

@@ -143,6 +143,13 @@ def components(points: np.ndarray, radius: float) -> np.ndarray:
     return connected_components(graph, directed=False)[1]
 
 
+def spacing(points: np.ndarray) -> float:
+    """Median distance of points (n, 3) to their nearest neighbour; 0 for fewer than two."""
+    if len(points) < 2:
+        return 0.0
+    return float(np.median(KDTree(points).query(points, 2)[0][:, 1]))
+
+
 def groups_to_try(points: np.ndarray, extent: float, seed: int) -> list[np.ndarray]:
     """Connected pieces of the seeds, and patches of the pieces that are large enough to be several parts at once."""
     label = components(points, 0.035 * extent)
@@ -416,7 +423,8 @@ def segment(
         ]
         kept, owned = problem.solve([m.T for m in chosen], config.part_cost * 2, parts)
         chosen = [chosen[k] for k in kept]
-    chosen, owned = split_pieces(chosen, owned, surfaces, extent, config)
+    if parts is None:
+        chosen, owned = split_pieces(chosen, owned, surfaces, extent, config)
     owned = reattach_fragments([m.T for m in chosen], owned, surfaces, extent)
     costs = costs_of(chosen) if chosen else np.ones((1, 1))
     unexplained = float((costs.min(1) >= config.explained_cost).mean())
@@ -459,7 +467,9 @@ def split_pieces(
     for k, motion in enumerate(motions):
         rows, piece = _pieces(k + 1, motion.T, owned, surfaces, extent)
         size = np.bincount(np.concatenate(piece), minlength=1)
-        for p in np.flatnonzero(size >= max(LARGE_PIECE * size.max(), 3 * config.min_part_seeds)):
+        large = size >= max(LARGE_PIECE * size.max(), 3 * config.min_part_seeds)
+        large[size.argmax()] = size.max() > 0
+        for p in np.flatnonzero(large):
             result.append(motion)
             for s in (0, 1):
                 labels[s][rows[s][piece[s] == p]] = len(result)
@@ -499,7 +509,7 @@ def _pieces(
     """Rows of one part's points in each state, and the connected piece of each, both states laid over each other."""
     rows = [np.flatnonzero(o == label) for o in owned]
     both = np.concatenate([moved(surfaces[0].points[rows[0]], T_1_0), surfaces[1].points[rows[1]]])
-    piece = components(both, 0.025 * extent)
+    piece = components(both, max(0.025 * extent, 2.5 * spacing(both)))
     return rows, np.split(piece, [len(rows[0])])
 
 
@@ -660,6 +670,8 @@ def registered(motion: Motion, source: Sheet, target: Sheet, extent: float) -> M
         sign = 1.0 if axis @ motion.axis * motion.value >= 0 else -1.0
         return replace(motion, axis=axis * sign, pivot=centroid, value=value * sign)
     screw = matrix_to_screw(T, centroid)
+    if screw.angle < 1e-3:  # A slide has no hinge line.
+        return motion
     sign = 1.0 if screw.axis @ motion.axis >= 0 else -1.0
     return replace(motion, axis=screw.axis * sign, pivot=screw.pivot, value=screw.angle * sign)
 
