@@ -1,5 +1,6 @@
 """From rigid motions to joints: the type by model comparison, then a constrained refinement (section 6)."""
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -18,6 +19,8 @@ from hingesplat.se3 import rotvec_to_matrix
 from hingesplat.training import Report, TrainingView, four_planes, training_view
 from hingesplat.twin import Joint, JointStd, JointType
 
+log = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class JointsConfig:
@@ -27,6 +30,10 @@ class JointsConfig:
     """Steps of each type's trial, Gaussians frozen."""
     type_significance: float = 2.0
     """A rotation must beat a slide by this many standard errors, since it has more numbers to fit with."""
+    type_gain: float = 0.03
+    """It must also lower the error around the part by this fraction: more numbers always fit a little better."""
+    hinge_reach: float = 1.0
+    """A hinge line farther than this from its part, in extents, is a slide in disguise."""
     steps: int = 400
     """Steps of the constrained refinement, everything together."""
     rate: float = 1e-3
@@ -207,7 +214,7 @@ def _choose_types(
     A slide is the simpler model, so a rotation must win significantly over the views. All joints are tried at once with
     one type and then the other; only a joint whose verdict is close depends on its neighbours' types.
     """
-    losses = {}
+    losses, reach = {}, torch.zeros(n_joints)
     for kind in ("prismatic", "revolute"):
         poses = poses_of([kind] * n_joints)
         adam = torch.optim.Adam([poses.theta], lr=config.rate)
@@ -220,6 +227,9 @@ def _choose_types(
             _picture_loss(g, sh, poses, training[s][i], s, config).backward()
             _joint_step(adam, config.rate, step / config.type_steps)
         losses[kind] = _losses_by_part(g, sh, training, poses, n_joints)
+        if kind == "revolute":
+            offset = (part_centres(g, n_joints + 1)[1:] - poses.pivot()).detach()
+            reach = torch.linalg.cross(offset, poses.axis().detach(), dim=1).norm(dim=1) / poses.extent
     kinds: list[JointType] = []
     confidence = np.zeros(n_joints)
     for j in range(n_joints):
@@ -227,9 +237,12 @@ def _choose_types(
         difference = difference[np.isfinite(difference)]
         error = difference.std() / math.sqrt(max(len(difference), 1)) + 1e-12
         z = float(difference.mean() / error) if len(difference) else 0.0
-        kinds.append("revolute" if z > config.type_significance else "prismatic")
+        gain = float(difference.mean() / np.nanmean(losses["prismatic"][:, j])) if len(difference) else 0.0
+        hinged = z > config.type_significance and gain > config.type_gain and float(reach[j]) < config.hinge_reach
+        log.debug("joint %d: z %.1f, gain %.3f, reach %.2f", j + 1, z, gain, float(reach[j]))
+        kinds.append("revolute" if hinged else "prismatic")
         # An even verdict between nested models speaks for the slide.
-        certainty = z - config.type_significance if kinds[-1] == "revolute" else config.type_significance - z
+        certainty = z - config.type_significance if hinged else max(config.type_significance - z, 0.0)
         confidence[j] = 0.5 * (1 + math.erf(certainty / math.sqrt(2)))
     return kinds, confidence
 
