@@ -37,6 +37,8 @@ class Options:
     seeds: tuple[int, ...] = (0, 1, 2)
     readme: Path | None = None
     """File whose table is set."""
+    recorded: bool = False
+    """Measure nothing: set the table from what ``benchmarks/results/`` holds."""
 
 
 def demo() -> list[dict[str, Any]]:
@@ -89,16 +91,13 @@ def set_table(readme: Path, table: str) -> None:
 def main() -> None:
     options = tyro.cli(Options, description=__doc__)
     console = Console()
-    bench_rasteriser.main()
-    rows = demo()
-    save("demo", rows)
-    rows = rows[-1:]
-    if options.captures is not None:
-        more = measure_all(CaptureOptions(options.captures, seeds=options.seeds), console)
-        save("captures", more)
-        rows += more
-    elif (recorded := RESULTS / "captures.json").is_file():
-        rows += json.loads(recorded.read_text())
+    if not options.recorded:
+        bench_rasteriser.main()
+        save("demo", demo()[-1:])
+        if options.captures is not None:
+            save("captures", measure_all(CaptureOptions(options.captures, seeds=options.seeds), console))
+    files = [RESULTS / f"{name}.json" for name in ("demo", "captures")]
+    rows = [row for file in files if file.is_file() for row in json.loads(file.read_text())]
     table = markdown(rows)
     console.print(table, soft_wrap=True, markup=False)
     if options.readme is not None:
