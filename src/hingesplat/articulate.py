@@ -20,7 +20,7 @@ from hingesplat.losses.vector_field import vector_loss
 from hingesplat.losses.velocity import fit_parts, velocity_loss
 from hingesplat.optim import GaussianAdam, LearningRates
 from hingesplat.poses import PoseDelta, StateLossConfig, move, part_centres, state_loss
-from hingesplat.training import Report, grow, training_view
+from hingesplat.training import Report, grow, shuffled, training_view
 
 
 @dataclass(frozen=True)
@@ -116,16 +116,12 @@ def articulate(
     optimiser = GaussianAdam(canonical, config.rates, extent, extra | identity.extra)
     training = [[training_view(v) for v in state] for state in views]
     repel_points = _repel_points(canonical, config, generator)
-    queue: list[tuple[int, int]] = []
+    photographs = shuffled(training, rng)
     statistics = torch.zeros((len(optimiser), 3))
     targets: list[_Targets] = []
     for step in range(config.steps):
         progress = step / config.steps
-        if not queue:
-            queue = [(s, i) for s, state in enumerate(training) for i in range(len(state))]
-            rng.shuffle(queue)
-        state, index = queue.pop()
-        view = training[state][index]
+        state, view = next(photographs)
         R, t = poses.Rt()
         p = identity.probabilities(optimiser, progress)
         if fitted and (not targets or step % 200 == 0) and (config.art_weight or config.vector_weight):

@@ -24,6 +24,7 @@ from hingesplat.training import (
     grow,
     mean_psnr,
     seen_weight,
+    shuffled,
     training_view,
 )
 
@@ -134,11 +135,10 @@ def _optimise(
     white = torch.ones(3)
     cameras = [v.camera for v in training]
     statistics = torch.zeros((len(optimiser), 3))
-    order: list[int] = []
+    photographs = shuffled([training], rng)
     for step in range(config.steps):
         progress = step / config.steps
-        order = order or list(rng.permutation(len(training)))
-        view = training[order.pop()]
+        _, view = next(photographs)
         loss, image = _view_loss(optimiser, view, config, extent, progress, white, statistics)
         loss.backward()
         optimiser.step(progress)
@@ -197,12 +197,10 @@ def _choose_sh_degree(
         padding = torch.zeros((len(base), (degree + 1) ** 2 - 1, 3))
         start = replace(base, sh=torch.cat([base.sh, padding], 1))
         trial = GaussianAdam(start, config.rates, extent)
-        order: list[int] = []
+        photographs = shuffled([training], rng)
         for step in range(steps):
-            order = order or list(rng.permutation(len(training)))
-            loss, _ = _view_loss(
-                trial, training[order.pop()], config, extent, 0.6 + 0.4 * step / steps, torch.ones(3), None
-            )
+            _, view = next(photographs)
+            loss, _ = _view_loss(trial, view, config, extent, 0.6 + 0.4 * step / steps, torch.ones(3), None)
             loss.backward()
             trial.step(0.6 + 0.4 * step / steps)
         fitted = trial.gaussians.detached()

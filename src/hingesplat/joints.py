@@ -16,7 +16,7 @@ from hingesplat.optim import GaussianAdam, LearningRates
 from hingesplat.poses import StateLossConfig, draw_state, part_centres, state_loss
 from hingesplat.screw import matrix_to_screw
 from hingesplat.se3 import rotvec_to_matrix
-from hingesplat.training import Report, TrainingView, four_planes, training_view
+from hingesplat.training import Report, TrainingView, four_planes, shuffled, training_view
 from hingesplat.twin import Joint, JointStd, JointType
 
 log = logging.getLogger(__name__)
@@ -155,14 +155,10 @@ def find_joints(
     extra = {"state_sh": (state_sh[1:].permute(1, 0, 2), config.rates.sh)}
     optimiser = GaussianAdam(gaussians, config.rates, extent, extra)
     adam = torch.optim.Adam([poses.theta], lr=config.rate)
-    queue: list[tuple[int, int]] = []
+    photographs = shuffled(training, rng)
     for step in range(config.steps):
         progress = step / config.steps
-        if not queue:
-            queue = [(s, i) for s, state in enumerate(training) for i in range(len(state))]
-            rng.shuffle(queue)
-        state, index = queue.pop()
-        view = training[state][index]
+        state, view = next(photographs)
         R, t = poses.Rt()
         loss, image = state_loss(optimiser, R[state], t[state], view, state, config.render, extent)
         loss.backward()
@@ -218,13 +214,10 @@ def _choose_types(
     for kind in ("prismatic", "revolute"):
         poses = poses_of([kind] * n_joints)
         adam = torch.optim.Adam([poses.theta], lr=config.rate)
-        moved = [(s, i) for s in range(1, len(training)) for i in range(len(training[s]))]
-        order: list[tuple[int, int]] = []
+        photographs = shuffled(training[1:], rng)
         for step in range(config.type_steps):
-            if not order:
-                order = [moved[j] for j in rng.permutation(len(moved))]
-            s, i = order.pop()
-            _picture_loss(g, sh, poses, training[s][i], s, config).backward()
+            state, view = next(photographs)
+            _picture_loss(g, sh, poses, view, state + 1, config).backward()
             _joint_step(adam, config.rate, step / config.type_steps)
         losses[kind] = _losses_by_part(g, sh, training, poses, n_joints)
         if kind == "revolute":

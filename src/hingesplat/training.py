@@ -1,6 +1,6 @@
 """What every optimisation loop shares: prepared photographs, depth regularisers, growing and pruning the set."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,6 +60,14 @@ def depth_variance(rendering: Rendering) -> Tensor:
     mean = rendering.depth / alpha
     variance = (rendering.channels[0] / alpha - mean.square()).clamp_min(0)
     return (variance * (rendering.alpha > 0.5)).mean()
+
+
+def shuffled(states: Sequence[Sequence[TrainingView]], rng: np.random.Generator) -> Iterator[tuple[int, TrainingView]]:
+    """Every photograph of every state, with its state's index, in a new order each round, for ever."""
+    everything = [(s, view) for s, state in enumerate(states) for view in state]
+    while True:
+        for i in rng.permutation(len(everything)):
+            yield everything[i]
 
 
 def grow(
