@@ -122,6 +122,18 @@ def on_surface(gaussians: Gaussians, sight: Sight) -> Surface:
     return Surface(points[index], colours[index], index, sight, normals_of(gaussians)[index])
 
 
+def survey(
+    gaussians: tuple[Gaussians, Gaussians], views: tuple[Sequence[View], Sequence[View]], config: SegmentConfig
+) -> tuple[np.ndarray, np.ndarray, tuple[Surface, Surface]]:
+    """Corners (3,) of both states together, and each state's visible surface."""
+    low, high = bounds([g.means.numpy() for g in gaussians])
+    tolerance = config.tolerance * float((high - low).max())
+    first, second = (
+        on_surface(g, look(g, v, config.sight_size, tolerance)) for g, v in zip(gaussians, views, strict=True)
+    )
+    return low, high, (first, second)
+
+
 def floating(answer: np.ndarray) -> np.ndarray:
     """(n,) bool: points that enough of the other state's cameras see in free space."""
     return (answer[:, FREE] >= 3) & (answer[:, FREE] > 0.15 * answer[:, : HIDDEN + 1].sum(1))
@@ -377,10 +389,9 @@ def segment(
         parts: number of movable parts, or None to find it.
     """
     rng = np.random.default_rng(seed)
-    low, high = bounds([g.means.numpy() for g in gaussians])
+    low, high, surfaces = survey(gaussians, views, config)
     extent = float((high - low).max())
-    sights = [look(g, v, config.sight_size, config.tolerance * extent) for g, v in zip(gaussians, views, strict=True)]
-    surfaces = (on_surface(gaussians[0], sights[0]), on_surface(gaussians[1], sights[1]))
+    sights = [surface.sight for surface in surfaces]
     seeds = []
     for s in (0, 1):
         surface = surfaces[s]
@@ -531,10 +542,8 @@ def track(
         motions: each part's joint, as ``segment`` found it.
     """
     rng = np.random.default_rng(seed)
-    low, high = bounds([g.means.numpy() for g in gaussians])
+    low, high, (here, there) = survey(gaussians, views, config)
     extent = float((high - low).max())
-    sights = [look(g, v, config.sight_size, config.tolerance * extent) for g, v in zip(gaussians, views, strict=True)]
-    here, there = on_surface(gaussians[0], sights[0]), on_surface(gaussians[1], sights[1])
     volume = score_volume(there.points, there.colours, there.sight, here.sight, low, high, 2 * config.cells)
     found = []
     for k, motion in enumerate(motions):
