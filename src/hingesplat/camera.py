@@ -59,6 +59,11 @@ class Camera:
         uv = np.stack([self.fx * p[:, 0] / safe + self.cx, self.fy * p[:, 1] / safe + self.cy], axis=1)
         return uv, z
 
+    def lifted(self, x: np.ndarray, y: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """World points (n, 3) at the centres of pixels (x, y) (n,) at depths (n,)."""
+        p = np.stack([(x + 0.5 - self.cx) / self.fx, (y + 0.5 - self.cy) / self.fy, np.ones(len(depth))], 1)
+        return (p * depth[:, None]) @ self.T_world_camera[:3, :3].T + self.centre
+
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
         """Origin (3,) and unit directions (height, width, 3) of the pixel-centre rays, world frame."""
         u, v = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)

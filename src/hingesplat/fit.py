@@ -11,10 +11,12 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from hingesplat.capture import View, visual_hull
-from hingesplat.gaussians import Gaussians
+from hingesplat.gaussians import SH_C0, Gaussians
 from hingesplat.losses.photometric import photometric, psnr
 from hingesplat.optim import GaussianAdam, LearningRates, morton_order
 from hingesplat.render import render
+from hingesplat.stereo import Cloud, DepthMap, fused, seen_through
+from hingesplat.surface import thin
 from hingesplat.training import (
     Report,
     TrainingView,
@@ -28,6 +30,9 @@ from hingesplat.training import (
     training_view,
 )
 
+FLATNESS = 0.5
+"""Thickness of a disc at the start, as a fraction of its width."""
+
 
 @dataclass(frozen=True)
 class FitConfig:
@@ -36,7 +41,7 @@ class FitConfig:
     steps: int = 1500
     """Optimiser steps."""
     start_gaussians: int = 4000
-    """Gaussians at the start, drawn from the visual hull's shell."""
+    """Gaussians at the start, on known depth and on the visual hull's shell."""
     max_gaussians: int = 10_000
     """Cap on the number of Gaussians."""
     densify_every: int = 100
@@ -58,34 +63,54 @@ class FitConfig:
     rates: LearningRates = field(default_factory=LearningRates)
 
 
-def start_from_points(points: np.ndarray, spacing: float, generator: torch.Generator) -> Gaussians:
-    """Grey, half-opaque balls on points (n, 3), each as wide as the distance to its neighbours."""
-    n = len(points)
+def start_from_cloud(cloud: Cloud, spacing: float) -> Gaussians:
+    """Half-opaque discs on the points of a cloud, each as wide as the distance to its neighbours."""
+    n, points = len(cloud), cloud.points
     distance = KDTree(points).query(points, min(4, n))[0][:, 1:].mean(1) if n > 1 else np.full(n, spacing)
-    means = torch.from_numpy(points.astype(np.float32))
-    log_scales = torch.from_numpy(np.log(np.maximum(distance, 1e-4) * 0.8).astype(np.float32))
+    log_scales = torch.from_numpy(np.log(np.maximum(distance, 1e-4) * 0.8).astype(np.float32))[:, None].repeat(1, 3)
+    log_scales[:, 2] += math.log(FLATNESS)
+    # Half a turn about the direction between z and the normal takes the one to the other.
+    between = torch.from_numpy(np.where(cloud.normals[:, 2:] > 0, cloud.normals, -cloud.normals).astype(np.float32))
+    between = between + torch.tensor([0.0, 0.0, 1.0])
     return Gaussians(
-        means=means,
-        quats=torch.randn((n, 4), generator=generator),
-        log_scales=log_scales[:, None].repeat(1, 3),
+        means=torch.from_numpy(points.astype(np.float32)),
+        quats=torch.cat([torch.zeros((n, 1)), between], 1),
+        log_scales=log_scales,
         logit_opacities=torch.zeros(n),
-        sh=torch.zeros((n, 1, 3)),
+        sh=torch.from_numpy(((cloud.colours - 0.5) / SH_C0).astype(np.float32))[:, None],
         part=torch.zeros(n, dtype=torch.int64),
     )
 
 
-def hull_shell(views: Sequence[View], n: int, rng: np.random.Generator) -> tuple[np.ndarray, float]:
-    """n points in the outer voxels of the visual hull, and the object's extent (longest side)."""
-    points, voxel = visual_hull(views, 96)
-    extent = float((points.max(0) - points.min(0)).max())
+def start_cloud(views: Sequence[View], maps: Sequence[DepthMap], n: int, rng: np.random.Generator) -> Cloud:
+    """About n evenly spread points to start from.
+
+    Where depth is known they lie on it; elsewhere, grey, on the shell of what is left of the visual hull when all
+    that known depth sees through is carved away.
+    """
+    hull, voxel = visual_hull(views, 96)
+    known = fused(maps, voxel)
+    left = hull[seen_through(hull, maps, 2 * voxel) < 2]
+    shell = left[_outer(left, voxel)]
+    if len(known):
+        shell = shell[KDTree(known.points).query(shell)[0] > 2 * voxel]
+    shell = shell + rng.uniform(-0.5, 0.5, shell.shape) * voxel
+    everything = known.joined(Cloud.of(shell))
+    size = voxel
+    for _ in range(5):  # The number of occupied cubes falls with the square of their size.
+        chosen = thin(everything.points, size, rng)
+        size *= math.sqrt(len(chosen) / n)
+    return everything.rows(chosen)
+
+
+def _outer(points: np.ndarray, voxel: float) -> np.ndarray:
+    """(n,) bool: voxel centres (n, 3) of a grid that lack some of the neighbours in a ball around them."""
     cell = np.round((points - points.min(0)) / voxel).astype(int)
     occupied = np.zeros(cell.max(0) + 1, np.int16)
     occupied[tuple(cell.T)] = 1
     ball = (np.square(np.indices((5, 5, 5)) - 2).sum(0) <= 2.5**2).astype(np.int16)
     neighbours = convolve(occupied, ball, mode="constant")[tuple(cell.T)]
-    weight = np.where(neighbours < 0.85 * neighbours.max(), 1.0, 0.15)
-    chosen = rng.choice(len(points), n, replace=len(points) < n, p=weight / weight.sum())
-    return points[chosen] + rng.uniform(-0.5, 0.5, (n, 3)) * voxel, extent
+    return neighbours < 0.85 * neighbours.max()
 
 
 def fit(
@@ -93,14 +118,16 @@ def fit(
     config: FitConfig,
     *,
     seed: int = 0,
-    points: np.ndarray | None = None,
+    maps: Sequence[DepthMap] = (),
+    cloud: Cloud | None = None,
     report: Report = lambda **_: None,
 ) -> Gaussians:
     """Photographs of one state to Gaussians on its surface.
 
     Args:
         views: posed photographs with masks.
-        points: (n, 3) start instead of the visual hull, world frame.
+        maps: their depth where it is known; the start is the visual hull where it is not.
+        cloud: start from these points instead of either.
         report: called now and then with ``step, steps, loss, psnr, gaussians``.
 
     Returns:
@@ -108,14 +135,13 @@ def fit(
     """
     rng = np.random.default_rng(seed)
     generator = torch.Generator().manual_seed(seed)
-    if points is None:
-        points, extent = hull_shell(views, config.start_gaussians, rng)
-    else:
-        extent = float((points.max(0) - points.min(0)).max())
+    if cloud is None:
+        cloud = start_cloud(views, maps, config.start_gaussians, rng)
+    extent = float((cloud.points.max(0) - cloud.points.min(0)).max())
     training = [training_view(v) for v in views]
     held_back = training[:: max(len(training) // 4, 2)][:4] if len(training) >= 12 else []
     kept = [v for v in training if not any(v is h for h in held_back)]
-    start = start_from_points(points, extent / 64, generator)
+    start = start_from_cloud(cloud, extent / 64)
     optimiser = GaussianAdam(start[morton_order(start.means)], config.rates, extent)
     _optimise(optimiser, kept, config, extent, rng, generator, report)
     cameras = [v.camera for v in training]

@@ -42,6 +42,7 @@ from hingesplat.pictures import write_motion_gif, write_summary
 from hingesplat.render import render
 from hingesplat.search import Motion
 from hingesplat.segment import Segmentation, SegmentConfig, segment, track
+from hingesplat.stereo import DepthMap, StereoConfig, depth_map, measured, stereo
 from hingesplat.twin import Joint, Part, Twin
 
 log = logging.getLogger(__name__)
@@ -54,7 +55,7 @@ MAX_UNEXPLAINED = 0.8
 NOISE = 10
 """Seeds, in those of the smallest part, below which nothing need have moved: one state photographed twice had 167."""
 ARTEFACTS = (
-    *("config.json", "stages.json", "log.txt", "fit_state*.safetensors", "segmentation.*"),
+    *("config.json", "stages.json", "log.txt", "depth_state*.safetensors", "fit_state*.safetensors", "segmentation.*"),
     *("canonical.safetensors", "articulation.safetensors", "gaussians*.safetensors", "twin.json"),
     *("parts", "export", "motion.gif", "summary.*", "metrics.json", "*.tmp"),
 )
@@ -74,7 +75,8 @@ class ReconstructConfig:
     max_size: int | None = None
     """Photographs longer than this many pixels are downsampled."""
     depth: bool = False
-    """Start the Gaussians from the capture's depth pictures where it has some."""
+    """Take depth from the capture's depth pictures instead of finding it by stereo."""
+    stereo: StereoConfig = field(default_factory=StereoConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     segment: SegmentConfig = field(default_factory=SegmentConfig)
     fuse: FuseConfig = field(default_factory=FuseConfig)
@@ -196,14 +198,23 @@ def _run_stages(run: Run) -> None:
 # The stages, each a function of the run that reads files and writes files.
 
 
+def _stereo(run: Run) -> None:
+    for t, views in enumerate(run.views):
+        config = run.config.stereo
+        maps = measured(views, config.image_size) if run.config.depth else stereo(views, config)
+        write_tensors(
+            run / f"depth_state{t}.safetensors", {str(i): torch.from_numpy(m.depth) for i, m in enumerate(maps)}
+        )
+        run.report(stage="stereo", state=t, step=t + 1, steps=len(run.views))
+
+
 def _fit(run: Run) -> None:
     for t, state in enumerate(run.capture.states):
         path = run / f"fit_state{t}.safetensors"
         if not path.is_file():
             config, seed = run.config.fit, run.config.seed
-            points = depth_points(state.train, config.start_gaussians, seed) if run.config.depth else None
             report = run.reporting("fit", state=t)
-            fit(state.train, config, seed=seed, points=points, report=report).save(path)
+            fit(state.train, config, seed=seed, maps=_depth(run, t), report=report).save(path)
 
 
 def _segment(run: Run) -> None:
@@ -211,7 +222,8 @@ def _segment(run: Run) -> None:
     last = len(run.capture.states) - 1
     pair = (_fitted(run, 0), _fitted(run, last))
     parts = None if run.config.parts == "auto" else run.config.parts - 1
-    found = segment(pair, (run.views[0], run.views[last]), run.config.segment, parts=parts, seed=run.config.seed)
+    views, maps = (run.views[0], run.views[last]), (_depth(run, 0), _depth(run, last))
+    found = segment(pair, views, run.config.segment, maps=maps, parts=parts, seed=run.config.seed)
     _check_explained(run, found, last)
     write_tensors(
         run / "segmentation.safetensors",
@@ -259,7 +271,8 @@ def _articulate(run: Run) -> None:
         motions = [Motion.of(m) for m in _read_json(run / "segmentation.json")["motions"]]
         for t in range(1, len(T_state_0) - 1):
             pair, views = (fitted[0], fitted[t]), (run.views[0], run.views[t])
-            T_state_0[t, 1:] = track(pair, views, labels, motions, run.config.segment, seed=run.config.seed)
+            maps = (_depth(run, 0), _depth(run, t))
+            T_state_0[t, 1:] = track(pair, views, labels, motions, run.config.segment, maps=maps, seed=run.config.seed)
     if len(T_1_0) == 1:
         moved = Articulation(canonical, T_state_0, torch.zeros(len(T_state_0), len(canonical), 3))
     else:
@@ -325,6 +338,7 @@ def _pictures(run: Run) -> None:
 
 
 STAGES: dict[str, Callable[[Run], None]] = {
+    "stereo": _stereo,
     "fit": _fit,
     "segment": _segment,
     "fuse": _fuse,
@@ -341,6 +355,11 @@ STAGES: dict[str, Callable[[Run], None]] = {
 
 def _fitted(run: Run, state: int) -> Gaussians:
     return Gaussians.load(run / f"fit_state{state}.safetensors")
+
+
+def _depth(run: Run, state: int) -> list[DepthMap]:
+    known, views = load_file(run / f"depth_state{state}.safetensors"), run.views[state]
+    return [depth_map(view, known[str(i)].numpy()) for i, view in enumerate(views)]
 
 
 def _result(run: Run) -> tuple[Gaussians, Twin]:
@@ -365,24 +384,6 @@ def _check_explained(run: Run, found: Segmentation, last: int) -> None:
             f"state {last}; check that the poses of both states share one frame, that the masks hold the "
             "object only, and that its parts are rigid"
         )
-
-
-def depth_points(views: Sequence[View], n: int, seed: int) -> np.ndarray | None:
-    """n points (n, 3) of the world frame drawn from the depth pictures' masked pixels; None without any."""
-    rng = np.random.default_rng(seed)
-    clouds = []
-    for view in views:
-        rows, columns = np.nonzero(
-            (view.depth > 0) & (view.rgba[..., 3] >= 128) if view.depth is not None else np.zeros((1, 1))
-        )
-        if view.depth is None or len(rows) == 0:
-            continue
-        chosen = rng.integers(len(rows), size=min(n, len(rows)))
-        v, u, c = rows[chosen], columns[chosen], view.camera
-        z = view.depth[v, u].astype(np.float64)
-        local = np.stack([(u + 0.5 - c.cx) / c.fx * z, (v + 0.5 - c.cy) / c.fy * z, z], 1)
-        clouds.append(local @ c.T_world_camera[:3, :3].T + c.centre)
-    return rng.choice(np.concatenate(clouds), n) if clouds else None
 
 
 def coloured(gaussians: Gaussians, offset: Tensor) -> Gaussians:

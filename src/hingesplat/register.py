@@ -9,6 +9,11 @@ from scipy.spatial.transform import Rotation
 from hingesplat.gaussians import Gaussians
 from hingesplat.se3 import wxyz_to_matrix
 
+COLOUR_LENGTH = 0.08
+"""A difference of 1 in colour counts as this fraction of the extent."""
+NORMAL_LENGTH = 0.03
+"""The same for a difference of 1 between normals: the two sides of a panel are two sheets."""
+
 
 @dataclass(frozen=True)
 class Sheet:
@@ -17,13 +22,20 @@ class Sheet:
     points: np.ndarray
     """(n, 3)"""
     normals: np.ndarray
-    """(n, 3) unit, either side."""
+    """(n, 3) unit, towards whoever sees the surface."""
     colours: np.ndarray
     """(n, 3)"""
 
-    def features(self, colour_length: float) -> np.ndarray:
-        """(n, 6) position, and colour in scene units: a difference of 1 counts as ``colour_length``."""
-        return np.concatenate([self.points, self.colours * colour_length], 1)
+    def features(self, T: np.ndarray, extent: float) -> np.ndarray:
+        """(n, 9) what has to be alike for two points to be one, after T: place, colour, side of the sheet."""
+        return np.concatenate(
+            [
+                self.points @ T[:3, :3].T + T[:3, 3],
+                self.colours * (COLOUR_LENGTH * extent),
+                self.normals @ T[:3, :3].T * (NORMAL_LENGTH * extent),
+            ],
+            1,
+        )
 
 
 def normals_of(gaussians: Gaussians) -> np.ndarray:
@@ -42,23 +54,21 @@ def register(
     iterations: int = 15,
     start_radius: float = 0.04,
     end_radius: float = 0.012,
-    colour_length: float = 0.08,
 ) -> np.ndarray:
-    """Refine T (4×4, source to target) by point-to-plane distance over pairs alike in place and colour.
+    """Refine T (4×4, source to target) by point-to-plane distance over pairs alike in place, colour and side.
 
     A light pull along the tangent keeps texture in place where planes slide on themselves. Pairs farther apart than the
     shrinking radius (fractions of the extent) are left out; directions that no pair constrains stay as they are.
     """
-    tree = KDTree(target.features(colour_length * extent))
+    tree = KDTree(target.features(np.eye(4), extent))
     for i in range(iterations):
         radius = extent * start_radius * (end_radius / start_radius) ** (i / max(iterations - 1, 1))
-        moved = source.points @ T[:3, :3].T + T[:3, 3]
-        query = np.concatenate([moved, source.colours * colour_length * extent], 1)
-        distance, index = map(np.asarray, tree.query(query))
+        moved = source.features(T, extent)
+        distance, index = map(np.asarray, tree.query(moved))
         near = distance < radius
         if near.sum() < 12:
             return T
-        p, q, n = moved[near], target.points[index[near]], target.normals[index[near]]
+        p, q, n = moved[near, :3], target.points[index[near]], target.normals[index[near]]
         centre = p.mean(0)
         arm = p - centre
         rows, residuals = [], []

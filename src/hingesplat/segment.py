@@ -11,16 +11,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
-from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse import coo_matrix, csr_matrix, identity
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from hingesplat.capture import View
-from hingesplat.gaussians import SH_C0, Gaussians
-from hingesplat.register import Sheet, normals_of, register
+from hingesplat.gaussians import Gaussians
+from hingesplat.register import Sheet, register
 from hingesplat.screw import matrix_to_screw
 from hingesplat.search import Motion, ScoreVolume, scan, score_volume
-from hingesplat.visibility import COLOUR, FREE, HIDDEN, SURFACE, Sight, ask, look
+from hingesplat.stereo import DepthMap
+from hingesplat.surface import Surface, bounds, surface_of, thin
+from hingesplat.visibility import COLOUR, FREE, HIDDEN, SURFACE, Sight, ask
 
 Labels = tuple[np.ndarray, np.ndarray]
 """Part id of every surface point of the two states."""
@@ -28,7 +30,13 @@ Labels = tuple[np.ndarray, np.ndarray]
 LARGE_PIECE = 0.2
 """A piece this large beside the largest of its part is a part of its own, not a fragment."""
 
-HIDDEN_SEED_COST = 0.5
+PROMISING = 0.6
+"""A hypothesis is worth as much as it explains its seeds better than this."""
+
+ARRIVED = 4
+"""Views that must see a surface where a motion takes a point, for the point to have been seen there."""
+
+HIDDEN_SEED_COST = 0.4
 """Cost of a seed that a motion takes out of everybody's sight."""
 
 
@@ -40,6 +48,8 @@ class SegmentConfig:
     """Longest side in pixels of the depth pictures that judge the hypotheses."""
     tolerance: float = 0.012
     """Half-width of a surface, as a fraction of the object's extent."""
+    spacing: float = 0.015
+    """Distance of the surface points that are labelled, as a fraction of the object's extent."""
     cells: int = 48
     """Voxels along the object's longest side in the coarse search."""
     seeds_per_search: int = 128
@@ -52,42 +62,14 @@ class SegmentConfig:
     """A seed agrees with a motion that costs it less than this."""
     consensus_motions: int = 30
     """Hypotheses that are refined on all seeds that agree with them."""
-    part_cost: float = 10.0
-    """Description length of one more part, in seeds (a seed stands for 0.012² of the extent's square)."""
+    part_cost: float = 45.0
+    """Description length of one more part, in points (a point stands for 0.03² of the extent's square)."""
     min_part_seeds: int = 25
     """A part must own at least this many seeds."""
-    max_parts: int = 12
-    """Upper bound on movable parts when their number is not given."""
+    candidates: int = 80
+    """Hypotheses among which the parts' motions are chosen."""
     rounds: int = 3
     """Rounds of relabelling and refining the motions."""
-
-
-@dataclass(frozen=True)
-class Surface:
-    """What was fitted to one state, thinned to the Gaussians that lie on its visible surface."""
-
-    points: np.ndarray
-    """(n, 3)"""
-    colours: np.ndarray
-    """(n, 3)"""
-    index: np.ndarray
-    """(n,) rows of the state's Gaussians."""
-    sight: Sight
-    normals: np.ndarray
-    """(n, 3)"""
-
-    def rows(self, index: np.ndarray) -> "Surface":
-        """The subset ``index``, seen by the same cameras."""
-        return Surface(self.points[index], self.colours[index], self.index[index], self.sight, self.normals[index])
-
-    def blurred(self, k: int = 8) -> np.ndarray:
-        """(n, 3) mean colour of each point and its neighbours: what a coarse voxel would show."""
-        index = KDTree(self.points).query(self.points, min(k, len(self.points)))[1]
-        return self.colours[index].mean(1)
-
-    @property
-    def sheet(self) -> Sheet:
-        return Sheet(self.points, self.normals, self.colours)
 
 
 @dataclass(frozen=True)
@@ -103,33 +85,19 @@ class Segmentation:
     """Number of (thinned) seeds of both states."""
 
 
-def bounds(surfaces: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corner (3,) of all points, a few stragglers aside, with a margin."""
-    points = np.concatenate(surfaces)
-    low, high = np.quantile(points, 0.002, axis=0), np.quantile(points, 0.998, axis=0)
-    margin = 0.03 * (high - low).max()
-    return low - margin, high + margin
-
-
-def on_surface(gaussians: Gaussians, sight: Sight) -> Surface:
-    """The Gaussians that the state's own cameras see on its surface."""
-    points = gaussians.means.numpy()
-    colours = (gaussians.sh[:, 0] * SH_C0 + 0.5).numpy()
-    answer = ask(points, colours, sight)
-    views = answer[:, : HIDDEN + 1].sum(1)
-    good = (answer[:, SURFACE] >= 2) & (answer[:, FREE] <= 0.15 * views) & (gaussians.opacities.numpy() > 0.2)
-    index = np.flatnonzero(good)
-    return Surface(points[index], colours[index], index, sight, normals_of(gaussians)[index])
-
-
 def survey(
-    gaussians: tuple[Gaussians, Gaussians], views: tuple[Sequence[View], Sequence[View]], config: SegmentConfig
+    gaussians: Sequence[Gaussians],
+    views: Sequence[Sequence[View]],
+    maps: Sequence[Sequence[DepthMap]],
+    config: SegmentConfig,
 ) -> tuple[np.ndarray, np.ndarray, tuple[Surface, Surface]]:
-    """Corners (3,) of both states together, and each state's visible surface."""
+    """Corners (3,) of two states together, and each state's visible surface."""
     low, high = bounds([g.means.numpy() for g in gaussians])
-    tolerance = config.tolerance * float((high - low).max())
+    extent = float((high - low).max())
+    spacing, tolerance = config.spacing * extent, config.tolerance * extent
     first, second = (
-        on_surface(g, look(g, v, config.sight_size, tolerance)) for g, v in zip(gaussians, views, strict=True)
+        surface_of(g, v, m, config.sight_size, spacing, tolerance)
+        for g, v, m in zip(gaussians, views, maps, strict=True)
     )
     return low, high, (first, second)
 
@@ -137,13 +105,6 @@ def survey(
 def floating(answer: np.ndarray) -> np.ndarray:
     """(n,) bool: points that enough of the other state's cameras see in free space."""
     return (answer[:, FREE] >= 3) & (answer[:, FREE] > 0.15 * answer[:, : HIDDEN + 1].sum(1))
-
-
-def thin(points: np.ndarray, size: float, rng: np.random.Generator) -> np.ndarray:
-    """Indices of one random point in each occupied cube of the given size, so that area counts, not texture."""
-    order = rng.permutation(len(points))
-    _, first = np.unique(np.floor(points[order] / size).astype(np.int64), axis=0, return_index=True)
-    return order[rng.permutation(first)]
 
 
 def components(points: np.ndarray, radius: float) -> np.ndarray:
@@ -199,34 +160,53 @@ def moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
     return points @ T[:3, :3].T + T[:3, 3]
 
 
-def select_motions(costs: np.ndarray, config: SegmentConfig, parts: int | None) -> list[int]:
-    """Greedy choice of the hypotheses (columns) that explain the seeds (rows) at the least description length.
+def distinct(motions: Sequence[Motion], costs: np.ndarray, points: np.ndarray, apart: float, limit: int) -> list[int]:
+    """The most promising hypotheses for all of the seeds, small parts' too, no two of them the same.
 
-    Args:
-        costs: (seeds, hypotheses).
-        parts: exactly this many, or as many as pay for themselves.
+    ``costs`` (seeds, motions). A seed counts less with every hypothesis that explains it. Two hypotheses are one if
+    they take ``points`` (n, 3) to places that lie within ``apart`` on average.
     """
-    unexplained = np.full(len(costs), config.explained_cost)
-    chosen: list[int] = []
-    price = config.part_cost
-    limit = parts if parts is not None else config.max_parts
-    while len(chosen) < limit:
-        gain = np.maximum(unexplained[:, None] - costs, 0)
-        # Seeds that merely vanish count as far as others are seen to arrive.
-        seen = np.where(costs < HIDDEN_SEED_COST, gain, 0).sum(0)
-        gain = seen + np.minimum(gain.sum(0) - seen, seen)
-        best = int(gain.argmax())
-        if gain[best] <= (0 if parts is not None else price):
+    gain = np.maximum(PROMISING - costs, 0)
+    ends = np.stack([moved(points, m.T) for m in motions])
+    left = np.ones(len(motions), bool)
+    weight = np.ones(len(costs))
+    kept: list[int] = []
+    while left.any() and len(kept) < limit:
+        best = int(np.where(left, weight @ gain, -1).argmax())
+        kept.append(best)
+        weight *= np.where(gain[:, best] > 0.3 * PROMISING, 0.7, 1.0)
+        left &= np.linalg.norm(ends - ends[best], axis=2).mean(1) > apart
+    return kept
+
+
+def eliminate(costs: np.ndarray, price: float, parts: int | None) -> list[int]:
+    """The fewest labels (columns) that explain the points (rows) at the least description length.
+
+    All are there at first; the one that is missed least goes, until every one is worth its price or ``parts`` are
+    left. Column 0, to stay, is free and stays. Two motions that are right together thus beat one that is nearly
+    right for both, which a greedy choice would take first.
+    """
+    kept = list(range(costs.shape[1]))
+    while len(kept) > 1 and len(kept) - 1 != parts:
+        best = np.argpartition(costs[:, kept], 1, axis=1)
+        first, second = (np.take_along_axis(costs[:, kept], best[:, [i]], 1)[:, 0] for i in (0, 1))
+        missed = np.bincount(best[:, 0], second - first, minlength=len(kept))
+        missed[0] = np.inf
+        least = int(missed.argmin())
+        if parts is None and missed[least] > price:
             break
-        chosen.append(best)
-        unexplained = np.minimum(unexplained, costs[:, best])
-        # A hypothesis that later ones made superfluous goes.
-        for old in list(chosen[:-1]):
-            rest = [c for c in chosen if c != old]
-            without = np.minimum(config.explained_cost, costs[:, rest].min(1))
-            if parts is None and (without - unexplained).sum() < price:
-                chosen, unexplained = rest, without
-    return chosen
+        kept.pop(least)
+    while True:  # Another one for one of these, as long as that explains more.
+        trials = []
+        for i in range(1, len(kept)):
+            rest = costs[:, kept[:i] + kept[i + 1 :]].min(1)
+            energy = np.minimum(costs, rest[:, None]).sum(0)
+            trials.append((float(energy.min()), i, int(energy.argmin())))
+        now = costs[:, kept].min(1).sum()
+        if not trials or min(trials)[0] > now - 1:
+            return kept[1:]
+        _, i, better = min(trials)
+        kept[i] = better
 
 
 def refine_motion(
@@ -251,29 +231,37 @@ def refine_motion(
 
 
 def label_costs(
-    surface: Surface, other: Sight, transforms: Sequence[np.ndarray], *, hidden_cost: float = 0.25
+    surface: Surface, other: Sight, transforms: Sequence[np.ndarray], *, extent: float, hidden_cost: float = 0.25
 ) -> np.ndarray:
     """(n, 1 + transforms) cost of each label for each surface point, from the other state's photographs alone.
 
     Label 0 is to stay; label k + 1 is to move by ``transforms[k]``, 4×4 from the surface's state to the other.
     """
+    at_home = _free_share(ask(surface.points, surface.colours, surface.sight))
     columns = []
     for T in [None, *transforms]:
         points = surface.points if T is None else moved(surface.points, T)
         answer = ask(points, surface.colours, other)
-        views = np.maximum(answer[:, : HIDDEN + 1].sum(1), 1)
-        free, seen, hidden = answer[:, FREE] / views, answer[:, SURFACE] / views, answer[:, HIDDEN] / views
-        contradiction = np.clip(free / 0.25, 0, 1)
-        colour = np.clip((answer[:, COLOUR] - 0.05) / 0.5, 0, 1) * seen / np.maximum(seen + hidden, 1e-6)
-        # To move is a claim: it costs a little, and more the farther it goes.
-        claim = 0.0 if T is None else 0.1 + 0.1 * np.linalg.norm(points - surface.points, axis=1)
-        columns.append(contradiction + 0.5 * colour + hidden_cost * hidden + claim)
+        # A point a little in front of its surface floats in some photographs of its own state, too.
+        contradiction = np.clip((_free_share(answer) - at_home - 0.02) / 0.2, 0, 1)
+        # Every surface is hidden from most sides: a few views that see it there are enough.
+        arrived = np.clip(answer[:, SURFACE] / ARRIVED, 0, 1)
+        colour = np.clip((answer[:, COLOUR] - 0.05) / 0.5, 0, 1)
+        # To move is a claim: it costs a little, and to be recognised far away costs more.
+        way = np.linalg.norm(points - surface.points, axis=1) / extent
+        claim = 0.0 if T is None else 0.05 + 0.3 * way * arrived
+        columns.append(contradiction + arrived * 0.5 * colour + (1 - arrived) * hidden_cost + claim)
     return np.stack(columns, 1)
 
 
-def seed_costs(seeds: Surface, other: Sight, transforms: Sequence[np.ndarray]) -> np.ndarray:
+def _free_share(answer: np.ndarray) -> np.ndarray:
+    """(n,) share of the views that see each point in free space."""
+    return answer[:, FREE] / np.maximum(answer[:, : HIDDEN + 1].sum(1), 1)
+
+
+def seed_costs(seeds: Surface, other: Sight, transforms: Sequence[np.ndarray], extent: float) -> np.ndarray:
     """(n, transforms) cost of each motion for each seed. Here hidden is worse than seen: a seed must go somewhere."""
-    return label_costs(seeds, other, transforms, hidden_cost=HIDDEN_SEED_COST)[:, 1:]
+    return label_costs(seeds, other, transforms, extent=extent, hidden_cost=HIDDEN_SEED_COST)[:, 1:]
 
 
 def neighbour_weights(points: np.ndarray, colours: np.ndarray, radius: float, k: int = 12) -> csr_matrix:
@@ -307,7 +295,11 @@ class Labelling:
     def costs(self, T_1_0: Sequence[np.ndarray]) -> list[np.ndarray]:
         """``label_costs`` of both states' points."""
         a, b = self.surfaces
-        return [label_costs(a, b.sight, T_1_0), label_costs(b, a.sight, [np.linalg.inv(T) for T in T_1_0])]
+        inverse = [np.linalg.inv(T) for T in T_1_0]
+        return [
+            label_costs(a, b.sight, T_1_0, extent=self.extent),
+            label_costs(b, a.sight, inverse, extent=self.extent),
+        ]
 
     def partners(self, T_1_0: Sequence[np.ndarray]) -> list[np.ndarray]:
         """(n_s, 1 + motions): the other state's point with which each point coincides under each label, or −1."""
@@ -346,6 +338,26 @@ class Labelling:
             q = updated
         return (q[0].argmax(1), q[1].argmax(1)), energy
 
+    def smoothed(self, T_1_0: Sequence[np.ndarray]) -> np.ndarray:
+        """(points of both states, 1 + motions) costs, each the mean over a point and its neighbours.
+
+        A point that a motion brings onto a surface asks that surface, too, how much it would rather be another's.
+        """
+        costs, partners = self.costs(T_1_0), self.partners(T_1_0)
+        result = []
+        for s in (0, 1):
+            regret = costs[1 - s] - costs[1 - s].min(1, keepdims=True)
+            there = np.take_along_axis(regret, np.maximum(partners[s], 0), 0)
+            both = np.minimum(costs[s] + np.where(partners[s] >= 0, 0.5 * there, 0), 1.2)
+            average = self.weights[s] + identity(len(both))
+            average = average.multiply(1 / average.sum(1)).tocsr()
+            result.append(average @ (average @ both))
+        return np.concatenate(result)
+
+    def labels(self, T_1_0: Sequence[np.ndarray]) -> Labels:
+        """Labels of both states' points under these motions, all of which stay."""
+        return self.mean_field(self.costs(T_1_0), self.partners(T_1_0))[0]
+
     def solve(self, T_1_0: Sequence[np.ndarray], part_cost: float, parts: int | None) -> tuple[list[int], Labels]:
         """Drop motions one by one as long as doing without costs less than a part.
 
@@ -378,6 +390,7 @@ def segment(
     views: tuple[Sequence[View], Sequence[View]],
     config: SegmentConfig,
     *,
+    maps: tuple[Sequence[DepthMap], Sequence[DepthMap]] = ((), ()),
     parts: int | None = None,
     seed: int = 0,
 ) -> Segmentation:
@@ -386,10 +399,11 @@ def segment(
     Args:
         gaussians: fitted to state 0 and to the other state.
         views: the training photographs of the same two states.
+        maps: the depth of these photographs where it is known.
         parts: number of movable parts, or None to find it.
     """
     rng = np.random.default_rng(seed)
-    low, high, surfaces = survey(gaussians, views, config)
+    low, high, surfaces = survey(gaussians, views, maps, config)
     extent = float((high - low).max())
     sights = [surface.sight for surface in surfaces]
     seeds = []
@@ -413,27 +427,36 @@ def segment(
     def costs_of(candidates: Sequence[Motion]) -> np.ndarray:
         """(seeds, candidates) what the other state's cameras say of every seed under every candidate."""
         forward, backward = [m.T for m in candidates], [inverted(m).T for m in candidates]
-        return np.concatenate([seed_costs(judges[0], sights[1], forward), seed_costs(judges[1], sights[0], backward)])
+        return np.concatenate(
+            [seed_costs(judges[0], sights[1], forward, extent), seed_costs(judges[1], sights[0], backward, extent)]
+        )
 
     costs = costs_of(pool)
     pool += consensus(pool, costs, surfaces, [i[: config.max_seeds] for i in seeds], fine, extent, config, rng)
     costs = np.concatenate([costs, costs_of(pool[costs.shape[1] :])], 1)
-    chosen = [pool[k] for k in select_motions(costs, config, parts)]
-    problem = Labelling.of(surfaces, extent)
-    owned: Labels = (np.zeros(len(surfaces[0].points), int), np.zeros(len(surfaces[1].points), int))
-    for round_ in range(config.rounds):
+    sample = np.concatenate([j.points[:100] for j in judges])
+    chosen = [pool[k] for k in distinct(pool, costs, sample, 0.012 * extent, config.candidates)]
+
+    rows = [thin(surface.points, 2 * config.spacing * extent, rng) for surface in surfaces]
+    problem = Labelling.of((surfaces[0].rows(rows[0]), surfaces[1].rows(rows[1])), extent)
+    kept = eliminate(problem.smoothed([m.T for m in chosen]), config.part_cost / 3, parts)
+    chosen = [chosen[k - 1] for k in kept]
+    for _ in range(config.rounds):
+        kept, owned = problem.solve([m.T for m in chosen], config.part_cost, parts)
         chosen = [
-            _refit(m, own, surfaces, fine, extent, 6.0 / 2**round_, config, rng)
-            for m, own in _owners(
-                chosen,
-                costs_of(chosen),
-                [s[: config.max_seeds] for s in seeds],
+            _refit(
+                chosen[k],
+                (rows[0][owned[0] == i + 1], rows[1][owned[1] == i + 1]),
+                surfaces,
+                fine,
+                extent,
                 config,
-                owned if round_ else None,
+                rng,
             )
+            for i, k in enumerate(kept)
         ]
-        kept, owned = problem.solve([m.T for m in chosen], config.part_cost * 2, parts)
-        chosen = [chosen[k] for k in kept]
+    problem = Labelling.of(surfaces, extent)
+    owned = problem.labels([m.T for m in chosen])
     if parts is None:
         chosen, owned = split_pieces(chosen, owned, surfaces, extent, config)
     owned = reattach_fragments([m.T for m in chosen], owned, surfaces, extent)
@@ -441,25 +464,6 @@ def segment(
     unexplained = float((costs.min(1) >= config.explained_cost).mean())
     labels = tuple(spread_labels(gaussians[s].means.numpy(), surfaces[s], owned[s]) for s in (0, 1))
     return Segmentation((labels[0], labels[1]), tuple(chosen), unexplained, n_seeds)
-
-
-def _owners(
-    motions: Sequence[Motion],
-    costs: np.ndarray,
-    seeds: Sequence[np.ndarray],
-    config: SegmentConfig,
-    owned: Labels | None,
-) -> list[tuple[Motion, tuple[np.ndarray, np.ndarray]]]:
-    """Each motion with the points of both states to refine it on: its labelled points, or at first its seeds."""
-    if owned is not None:
-        return [
-            (m, (np.flatnonzero(owned[0] == k + 1), np.flatnonzero(owned[1] == k + 1))) for k, m in enumerate(motions)
-        ]
-    if not motions:
-        return []
-    owner = np.where(costs.min(1) < config.explained_cost, costs.argmin(1), -1)
-    first, second = owner[: len(seeds[0])], owner[len(seeds[0]) :]
-    return [(m, (seeds[0][first == k], seeds[1][second == k])) for k, m in enumerate(motions)]
 
 
 def split_pieces(
@@ -473,12 +477,16 @@ def split_pieces(
 
     Two doors one above the other, turned by the same angle about the same line, are such a pair.
     """
+    owned = _rejoined(motions, owned, surfaces, extent)
     result: list[Motion] = []
     labels = (np.zeros_like(owned[0]), np.zeros_like(owned[1]))
     for k, motion in enumerate(motions):
         rows, piece = _pieces(k + 1, motion.T, owned, surfaces, extent)
-        size = np.bincount(np.concatenate(piece), minlength=1)
-        large = size >= max(LARGE_PIECE * size.max(), 3 * config.min_part_seeds)
+        each = [np.bincount(p, minlength=max(int(q.max(initial=0)) for q in piece) + 1) for p in piece]
+        size = each[0] + each[1]
+        # A part is seen in both states; what is seen in one only is the inside of something.
+        large = size >= max(LARGE_PIECE * size.max(), 5 * config.min_part_seeds)
+        large &= np.minimum(*each) >= config.min_part_seeds
         large[size.argmax()] = size.max() > 0
         for p in np.flatnonzero(large):
             result.append(motion)
@@ -494,6 +502,27 @@ def split_pieces(
     return result, labels
 
 
+def _rejoined(motions: Sequence[Motion], owned: Labels, surfaces: tuple[Surface, Surface], extent: float) -> Labels:
+    """Stray pieces go to a part that they touch and that would take them to the same place."""
+    labels = (owned[0].copy(), owned[1].copy())
+    for k, motion in enumerate(motions):
+        rows, piece = _pieces(k + 1, motion.T, owned, surfaces, extent)
+        size = np.bincount(np.concatenate(piece), minlength=1)
+        for p in np.flatnonzero((size > 0) & (np.arange(len(size)) != size.argmax())):
+            mine = [rows[s][piece[s] == p] for s in (0, 1)]
+            s = int(len(mine[1]) > len(mine[0]))
+            points = surfaces[s].points[mine[s]]
+            for j, other in enumerate(motions):
+                theirs = surfaces[s].points[owned[s] == j + 1]
+                ends = [moved(points, T if s == 0 else np.linalg.inv(T)) for T in (motion.T, other.T)]
+                alike = np.linalg.norm(ends[0] - ends[1], axis=1).mean() < 0.03 * extent
+                if j != k and alike and len(theirs) and KDTree(theirs).query(points)[0].min() < 0.03 * extent:
+                    for state in (0, 1):
+                        labels[state][mine[state]] = j + 1
+                    break
+    return labels
+
+
 def reattach_fragments(
     T_1_0: Sequence[np.ndarray], owned: Labels, surfaces: tuple[Surface, Surface], extent: float
 ) -> Labels:
@@ -502,7 +531,7 @@ def reattach_fragments(
     for k, T in enumerate([np.eye(4), *T_1_0]):
         rows, piece = _pieces(k, T, owned, surfaces, extent)
         size = np.bincount(np.concatenate(piece), minlength=1)
-        small = size < (LARGE_PIECE if k else 0.02) * size.max()
+        small = size < (size.max() if k else 0.02 * size.max())
         for s in (0, 1):
             stray[s][rows[s][small[piece[s]]]] = True
     labels = (owned[0].copy(), owned[1].copy())
@@ -531,6 +560,7 @@ def track(
     motions: Sequence[Motion],
     config: SegmentConfig,
     *,
+    maps: tuple[Sequence[DepthMap], Sequence[DepthMap]] = ((), ()),
     seed: int = 0,
 ) -> list[np.ndarray]:
     """T_t_0 (4×4) of every part in a further state, its joint known from another pair of states.
@@ -542,12 +572,13 @@ def track(
         motions: each part's joint, as ``segment`` found it.
     """
     rng = np.random.default_rng(seed)
-    low, high, (here, there) = survey(gaussians, views, config)
+    low, high, (here, there) = survey(gaussians, views, maps, config)
     extent = float((high - low).max())
     volume = score_volume(there.points, there.colours, there.sight, here.sight, low, high, 2 * config.cells)
+    own_label = labels[KDTree(gaussians[0].means.numpy()).query(here.points)[1]]
     found = []
     for k, motion in enumerate(motions):
-        own = np.flatnonzero(labels[here.index] == k + 1)
+        own = np.flatnonzero(own_label == k + 1)
         if len(own) < config.min_part_seeds:
             found.append(np.eye(4))
             continue
@@ -630,7 +661,7 @@ def consensus(
         ends.append(end)
         motion, agree = pool[k], costs[:, k] < config.consensus_cost
         own = (seeds[0][agree[: len(seeds[0])]], seeds[1][agree[len(seeds[0]) :]])
-        refined.append(_refit(motion, own, surfaces, fine, extent, 3.0, config, rng))
+        refined.append(_refit(motion, own, surfaces, fine, extent, config, rng))
         if len(refined) == config.consensus_motions:
             break
     return refined
@@ -642,28 +673,50 @@ def _refit(
     surfaces: tuple[Surface, Surface],
     fine: Sequence[ScoreVolume],
     extent: float,
-    spread_deg: float,
     config: SegmentConfig,
     rng: np.random.Generator,
 ) -> Motion:
-    """Refine on the points that the motion owns, in whichever state has more of them."""
+    """Refine on the points that the motion owns, from the state that has more of them to those of the other."""
     s = int(len(own[1]) > len(own[0]))
     if len(own[s]) < config.min_part_seeds:
         return motion
-    chosen = rng.choice(own[s], min(2 * config.seeds_per_search, len(own[s])), replace=False)
-    mine, other = surfaces[s].rows(chosen), surfaces[1 - s]
+    limit = 4 * config.seeds_per_search
+    mine, theirs = (surfaces[t].rows(rng.choice(own[t], min(limit, len(own[t])), replace=False)) for t in (s, 1 - s))
     start = motion if s == 0 else inverted(motion)
-    fit = polished(
-        [start, refine_motion(start, mine.points, mine.colours, fine[1 - s], spread_deg)], mine, other, extent
-    )
+    if len(theirs.points) < config.min_part_seeds:
+        few = mine.rows(np.arange(min(2 * config.seeds_per_search, len(mine.points))))
+        near = refine_motion(start, few.points, few.colours, fine[1 - s], 3.0)
+        fit = polished([start, near], mine, surfaces[1 - s], extent)
+        return fit if s == 0 else inverted(fit)
+    # Against the whole of the other state a drawer would cling to the frame that it slides along.
+    target = surfaces[1 - s].rows(own[1 - s]).sheet
+    once = registered(start, mine.sheet, target, extent)
+    trials = [start, once, registered(once, mine.sheet, target, extent)]
+
+    def best(motions: Sequence[Motion]) -> Motion:
+        there = seed_costs(mine, surfaces[1 - s].sight, [m.T for m in motions], extent).sum(0)
+        back = seed_costs(theirs, surfaces[s].sight, [inverted(m).T for m in motions], extent).sum(0)
+        return motions[int((there + back).argmin())]
+
+    fit = best(values_around(best(trials), extent))
     return fit if s == 0 else inverted(fit)
 
 
+def values_around(motion: Motion, extent: float) -> list[Motion]:
+    """The motion, and a little more or less of it: along a slide only few faces hold a registration."""
+    reach = np.radians(3) if motion.kind == "revolute" else 0.02 * extent
+    return [replace(motion, value=motion.value + d * reach) for d in (0, -1, -0.5, -0.25, -0.1, 0.1, 0.25, 0.5, 1)]
+
+
 def polished(trials: Sequence[Motion], mine: Surface, other: Surface, extent: float) -> Motion:
-    """The best of some motions and their registrations, as the other state's cameras judge them."""
-    everyone = [*trials, *(registered(m, mine.sheet, other.sheet, extent) for m in trials)]
-    costs = seed_costs(mine, other.sight, [m.T for m in everyone])
-    return everyone[int(costs.mean(0).argmin())]
+    """The best of some motions, their registrations and a little more or less of these, as the cameras judge them."""
+
+    def best(motions: Sequence[Motion]) -> Motion:
+        costs = seed_costs(mine, other.sight, [m.T for m in motions], extent)
+        return motions[int(costs.mean(0).argmin())]
+
+    motion = best([*trials, *(registered(m, mine.sheet, other.sheet, extent) for m in trials)])
+    return best(values_around(motion, extent))
 
 
 def registered(motion: Motion, source: Sheet, target: Sheet, extent: float) -> Motion:
@@ -686,11 +739,8 @@ def registered(motion: Motion, source: Sheet, target: Sheet, extent: float) -> M
 
 
 def spread_labels(points: np.ndarray, surface: Surface, labels: np.ndarray) -> np.ndarray:
-    """(n,) labels for all Gaussians: those off the surface take their nearest surface point's."""
-    nearest = KDTree(surface.points).query(points)[1]
-    spread = labels[nearest]
-    spread[surface.index] = labels
-    return spread
+    """(n,) labels for all Gaussians at points (n, 3): each takes its nearest surface point's."""
+    return labels[KDTree(surface.points).query(points)[1]]
 
 
 __all__ = ["SegmentConfig", "Segmentation", "segment", "track"]

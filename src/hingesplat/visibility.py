@@ -11,10 +11,12 @@ import numpy as np
 import torch
 from numba import njit
 
+from hingesplat.camera import Camera
 from hingesplat.capture import View
 from hingesplat.gaussians import Gaussians
 from hingesplat.render import render
 from hingesplat.simd import parallel
+from hingesplat.stereo import DepthMap, seen_through
 
 FREE, SURFACE, HIDDEN, COLOUR = range(4)
 """Columns of ``ask``'s answer."""
@@ -35,17 +37,21 @@ class Sight:
 
 
 @torch.no_grad()
-def look(gaussians: Gaussians, views: Sequence[View], size: int, tolerance: float) -> Sight:
-    """Render the state's depth at most ``size`` pixels wide from each photograph's camera.
+def look(
+    gaussians: Gaussians, views: Sequence[View], size: int, tolerance: float, maps: Sequence[DepthMap] = ()
+) -> Sight:
+    """The state's depth at most ``size`` pixels wide from each photograph's camera.
 
-    The mask comes from the photograph, so that a floater makes no surface where the photograph shows background.
+    It is rendered, but for pixels whose depth ``maps`` (one a photograph, or none) know; and nothing is said of
+    pixels where the maps see through what is rendered: fits put lids on hollows. The mask comes from the photograph,
+    so that a floater makes no surface where the photograph shows background.
     """
     longest = max(max(v.camera.width, v.camera.height) for v in views)
     factor = max(longest / size, 1.0)
     width = max(round(v.camera.width / factor) for v in views)
     height = max(round(v.camera.height / factor) for v in views)
     P, depth, rgb = [], [], []
-    for view in views:
+    for i, view in enumerate(views):
         camera = view.camera.scaled(round(view.camera.width / factor), round(view.camera.height / factor))
         r = render(gaussians, camera)
         rgba = torch.from_numpy(view.rgba).permute(2, 0, 1)[None].float() / 255
@@ -53,6 +59,8 @@ def look(gaussians: Gaussians, views: Sequence[View], size: int, tolerance: floa
         mask = small[3] > 0.5
         solid = r.alpha > 0.3
         d = torch.where(mask & solid, r.depth / r.alpha.clamp_min(1e-3), torch.where(mask, -1.0, 0.0))
+        if maps:
+            d = torch.from_numpy(_corrected(d.numpy(), camera, maps[i], maps, 2 * tolerance))
         picture = small[:3] * small[3:] + 1 - small[3:]
         pad = (0, width - camera.width, 0, height - camera.height)
         depth.append(torch.nn.functional.pad(d, pad).numpy())
@@ -65,6 +73,21 @@ def look(gaussians: Gaussians, views: Sequence[View], size: int, tolerance: floa
         np.ascontiguousarray(np.stack(rgb), dtype=np.float32),
         tolerance,
     )
+
+
+def _corrected(
+    rendered: np.ndarray, camera: Camera, own: DepthMap, maps: Sequence[DepthMap], tolerance: float
+) -> np.ndarray:
+    """Rendered depth (h, w) where maps know better: their depth, or -1 where they see through it."""
+    h, w = rendered.shape
+    rows = ((np.arange(h) + 0.5) * own.depth.shape[0] / h).astype(int)
+    columns = ((np.arange(w) + 0.5) * own.depth.shape[1] / w).astype(int)
+    known = own.depth[rows[:, None], columns]
+    y, x = np.nonzero((rendered > 0) & (known == 0))
+    lid = seen_through(camera.lifted(x, y, rendered[y, x]), maps, tolerance) >= 2
+    depth = np.where((rendered != 0) & (known > 0), known, rendered)
+    depth[y[lid], x[lid]] = -1
+    return depth
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -1,0 +1,83 @@
+"""What one state shows of itself: points on its visible surface, and what its photographs say of any other point."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from hingesplat.capture import View
+from hingesplat.gaussians import SH_C0, Gaussians
+from hingesplat.register import Sheet, normals_of
+from hingesplat.stereo import DepthMap, fused, seen_through
+from hingesplat.visibility import FREE, HIDDEN, SURFACE, Sight, ask, look
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Points on the visible surface of one state, and the photographs that see it."""
+
+    points: np.ndarray
+    """(n, 3)"""
+    colours: np.ndarray
+    """(n, 3)"""
+    normals: np.ndarray
+    """(n, 3) unit, either side."""
+    sight: Sight
+
+    def rows(self, index: np.ndarray) -> "Surface":
+        """The subset ``index``, seen by the same cameras."""
+        return Surface(self.points[index], self.colours[index], self.normals[index], self.sight)
+
+    def blurred(self, k: int = 8) -> np.ndarray:
+        """(n, 3) mean colour of each point and its neighbours: what a coarse voxel would show."""
+        index = KDTree(self.points).query(self.points, min(k, len(self.points)))[1]
+        return self.colours[index].mean(1)
+
+    @property
+    def sheet(self) -> Sheet:
+        return Sheet(self.points, self.normals, self.colours)
+
+
+def bounds(surfaces: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner (3,) of all points, a few stragglers aside, with a margin."""
+    points = np.concatenate(surfaces)
+    low, high = np.quantile(points, 0.002, axis=0), np.quantile(points, 0.998, axis=0)
+    margin = 0.03 * (high - low).max()
+    return low - margin, high + margin
+
+
+def thin(points: np.ndarray, size: float, rng: np.random.Generator) -> np.ndarray:
+    """Indices of one random point in each occupied cube of the given size, so that area counts, not texture."""
+    order = rng.permutation(len(points))
+    _, first = np.unique(np.floor(points[order] / size).astype(np.int64), axis=0, return_index=True)
+    return order[rng.permutation(first)]
+
+
+def surface_of(
+    gaussians: Gaussians, views: Sequence[View], maps: Sequence[DepthMap], size: int, spacing: float, tolerance: float
+) -> Surface:
+    """The visible surface: what depth maps know, and where they know nothing, the Gaussians.
+
+    Args:
+        gaussians: fitted to the state.
+        views, maps: its photographs, and their depth where it is known.
+        size: longest side in pixels of the pictures that judge.
+        spacing: of the points, scene units.
+        tolerance: half-width of a surface, scene units.
+    """
+    sight = look(gaussians, views, size, tolerance, maps)
+    cloud = fused(maps, spacing)
+    points, colours = gaussians.means.numpy().astype(np.float64), (gaussians.sh[:, 0] * SH_C0 + 0.5).numpy()
+    alone = (gaussians.opacities.numpy() > 0.2) & (seen_through(points, maps, 2 * tolerance) < 2)
+    if len(cloud):
+        alone &= KDTree(cloud.points).query(points)[0] > 2 * spacing
+    surface = Surface(
+        np.concatenate([cloud.points, points[alone]]),
+        np.concatenate([cloud.colours, colours[alone]]),
+        np.concatenate([cloud.normals, normals_of(gaussians)[alone]]),
+        sight,
+    )
+    answer = ask(surface.points, surface.colours, sight)
+    views_of_it = answer[:, : HIDDEN + 1].sum(1)
+    return surface.rows(np.flatnonzero((answer[:, SURFACE] >= 2) & (answer[:, FREE] <= 0.15 * views_of_it)))
