@@ -32,7 +32,8 @@ def noise(x: np.ndarray, seed: int) -> np.ndarray:
     i = floor.astype(np.int32)
     total = np.zeros(len(x), np.float32)
     for corner in np.ndindex(2, 2, 2):
-        weight = np.prod(np.where(np.asarray(corner, bool), f, 1 - f), axis=1)
+        a, b, c = np.where(np.asarray(corner, bool), f, 1 - f).T
+        weight = a * b * c
         total += weight * _hash(i[:, 0] + corner[0], i[:, 1] + corner[1], i[:, 2] + corner[2], seed)
     return total
 
@@ -92,6 +93,51 @@ def speckle(base: Colour, spots: Colour, size: float, seed: int, cover: float = 
         slow = fractal(p * 0.12, seed + 7, 2)
         hue = noise(p * 0.2, seed + 13)[:, None] * np.array([0.10, -0.03, -0.10])
         return np.clip(_mix(base, spots, flecks) * (0.7 + 0.6 * slow)[:, None] + hue - hue.mean(0), 0, 1)
+
+    return texture
+
+
+def plain(colour: Colour, seed: int, depth: float = 0.08, size: float = 0.1) -> Texture:
+    """Paint that is nearly one colour: slow changes of brightness by ``depth``."""
+
+    def texture(x: np.ndarray, face: int) -> np.ndarray:
+        slow = fractal(_own(x, face) / size, seed, 2)
+        return np.clip(np.asarray(colour) * (1 + depth * (2 * slow - 1))[:, None], 0, 1)
+
+    return texture
+
+
+def brushed(colour: Colour, axis: int, seed: int, depth: float = 0.25, size: float = 0.004) -> Texture:
+    """Metal with fine scratches along ``axis``."""
+    stretch = np.full(3, 1.0)
+    stretch[axis] = 0.03
+
+    def texture(x: np.ndarray, face: int) -> np.ndarray:
+        p = _own(x, face)
+        streaks = 0.7 * fractal(p * stretch / size, seed, 2) + 0.3 * noise(p / (20 * size), seed + 9)
+        return np.clip(np.asarray(colour) * (1 + depth * (2 * streaks - 1))[:, None], 0, 1)
+
+    return texture
+
+
+def stripes(a: Texture, b: Texture, axis: int, period: float, share: float = 0.5, start: float = 0.0) -> Texture:
+    """``b`` on ``share`` of every ``period`` along ``axis`` from ``start`` on, ``a`` on the rest."""
+
+    def texture(x: np.ndarray, face: int) -> np.ndarray:
+        second = ((x[:, axis] - start) / period) % 1 < share
+        return np.where(second[:, None], b(x, face), a(x, face))
+
+    return texture
+
+
+def inlay(outer: Texture, inner: Texture, margin: float) -> Texture:
+    """``inner`` on every face but for a frame of ``outer``, ``margin`` wide."""
+
+    def texture(x: np.ndarray, face: int) -> np.ndarray:
+        low, high = x.min(0), x.max(0)
+        wide = high - low > 2 * margin
+        within = ((x > low + margin) & (x < high - margin) | ~wide).all(1) & (wide.sum() > 1)
+        return np.where(within[:, None], inner(x, face), outer(x, face))
 
     return texture
 

@@ -1,7 +1,8 @@
 """Ray-traced pictures of a model: light is traced once a state into texels, and pictures look it up.
 
-Every surface is matt, so what leaves a texel is the same in all directions and can be kept. Light comes
-from suns and a sky dome that stay fixed in the world; shading and cast shadows thus change with the motion.
+What a matt surface sends out is the same in all directions and can be kept with the texel; the clear coat of a
+glossy one is added picture by picture. Light comes from suns and a sky dome that stay fixed in the world;
+shading, cast shadows and highlights thus change with the motion.
 """
 
 from dataclasses import dataclass
@@ -13,13 +14,16 @@ from embreex.rtcore_scene import EmbreeScene
 from scipy.ndimage import gaussian_filter, zoom
 
 from hingesplat.camera import Camera
-from hingesplat.synth.objects import Model
+from hingesplat.synth.model import Model
 from hingesplat.synth.shapes import Patch
 
 SAMPLES = 3  # A side: 3 × 3 rays a pixel.
 LIGHT_STEP = 2  # Light is traced on every second texel each way; it is smoother than the textures.
 AMBIENT = 0.14  # Of full light, everywhere: what bounces between surfaces.
 GAMMA = 2.2
+SUNS = 3
+SHININESS = 60.0  # Of Blinn's highlight; a clear coat reflects F0 of what meets it head-on.
+F0 = 0.05
 
 
 def _lights() -> tuple[np.ndarray, np.ndarray]:
@@ -54,7 +58,7 @@ class Surface:
     def __init__(self, model: Model, texel: float) -> None:
         """``texel`` is the edge of a texel in model units."""
         self.model = model
-        vertices, coords, faces, patch_of, body_of, albedo = [], [], [], [], [], []
+        vertices, coords, faces, patch_of, body_of, albedo, normals, gloss = [], [], [], [], [], [], [], []
         self.texels: list[Texels] = []
         n_vertices = offset = 0
         for number, body in enumerate(model.bodies):
@@ -65,6 +69,8 @@ class Surface:
                 s, t = _grid(patch, light_shape)
                 self.texels.append(Texels(body.name, shape, offset, light_shape, patch.at(s, t), patch.normals(s, t)))
                 albedo.append(patch.texture(patch.at(*_grid(patch, shape)), patch.face))
+                normals.append(patch.normals(st[:, 0], st[:, 1]))
+                gloss.append(patch.gloss)
                 vertices.append(v)
                 coords.append(st / np.asarray(patch.size) * shape)
                 faces.append(f + n_vertices)
@@ -75,6 +81,7 @@ class Surface:
         self.vertices, self.faces = np.concatenate(vertices), np.concatenate(faces)
         self.corner_texel = np.concatenate(coords)[self.faces].astype(np.float32)  # (triangles, 3, 2)
         self.patch_of, self.body_of_vertex = np.concatenate(patch_of), np.concatenate(body_of)
+        self.gloss, self.corner_normal = np.array(gloss), np.concatenate(normals)[self.faces].astype(np.float32)
         self.albedo = np.clip(np.concatenate(albedo), 0.01, 1) ** GAMMA
 
 
@@ -91,6 +98,7 @@ class LitScene:
         self.surface, self.poses = surface, poses
         per_body = np.stack([poses[b.name] for b in surface.model.bodies])[surface.body_of_vertex]
         self.vertices = (per_body[:, :3, :3] @ surface.vertices[:, :, None])[..., 0] + per_body[:, :3, 3]
+        self.shift = 1e-3 * float(np.ptp(self.vertices, axis=0).max())  # Rays start so far off the surface.
         self.device = EmbreeDevice()
         self.scene = EmbreeScene(self.device)
         TriangleMesh(self.scene, self.vertices.astype(np.float32), surface.faces.astype(np.int32))
@@ -102,12 +110,11 @@ class LitScene:
     def _light(self) -> np.ndarray:
         """sRGB bytes leaving every texel, (texels, 3) float32 in 0–255."""
         directions, colours = _lights()
-        shift = 1e-3 * float(np.ptp(self.vertices, axis=0).max())
         points, normals = [], []
         for texels in self.surface.texels:
             T = self.poses[texels.body]
             n = texels.normals @ T[:3, :3].T
-            points.append(texels.points @ T[:3, :3].T + T[:3, 3] + shift * n)
+            points.append(texels.points @ T[:3, :3].T + T[:3, 3] + self.shift * n)
             normals.append(n)
         x, n = np.concatenate(points).astype(np.float32), np.concatenate(normals)
         light = np.full(x.shape, AMBIENT)
@@ -149,6 +156,12 @@ class LitScene:
         rgba = np.zeros((len(d), 4), np.float32)
         rgba[found, :3] = self.colours[self.offsets[patch] + ij[:, 0] * self.shapes[patch, 1] + ij[:, 1]]
         rgba[found, 3] = 255
+        if (coat := np.flatnonzero(self.surface.gloss[patch])).size:
+            bary = np.concatenate([1 - u - v, u, v], 1)[coat]
+            x = origin + d[found[coat]] * hit["tfar"][found[coat], None]
+            shine = self._shine(x, d[found[coat]], face[coat], bary) * self.surface.gloss[patch[coat], None]
+            under = (rgba[found[coat], :3] / 255) ** GAMMA
+            rgba[found[coat], :3] = 255 * np.clip(under + shine, 0, 1) ** (1 / GAMMA)
         # One raw array for what only the pixel's centre tells: z-depth and body.
         centre = np.zeros((len(d), 2), np.float32)
         centre[found, 0] = hit["tfar"][found] * (d[found] @ camera.T_world_camera[:3, 2])
@@ -162,6 +175,33 @@ class LitScene:
         m = SAMPLES // 2
         middle[y0 : y0 + h, x0 : x0 + w] = centre.reshape(h, SAMPLES, w, SAMPLES, 2)[:, m, :, m]
         return picture, middle[..., 0], middle[..., 1].astype(np.uint8)
+
+    def _shine(self, x: np.ndarray, directions: np.ndarray, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
+        """What a clear coat at the points (n, 3) adds, seen along ``directions``: highlights of the suns, and the sky.
+
+        Linear RGB (n, 3). Bodies of the object darken the sky, but are not mirrored.
+        """
+        body = self.body_of_face[face]
+        turn = np.stack([self.poses[b.name][:3, :3] for b in self.surface.model.bodies])[body]
+        n = (turn @ (bary[:, :, None] * self.surface.corner_normal[face]).sum(1)[:, :, None])[..., 0]
+        n /= np.linalg.norm(n, axis=1, keepdims=True)
+        d = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        facing = np.clip(-(n * d).sum(1), 0, 1)
+        mirrored = d + 2 * facing[:, None] * n
+        fresnel = F0 + (1 - F0) * (1 - facing) ** 5
+        start = (x + 2 * self.shift * n).astype(np.float32)
+        free = self.scene.run(start, mirrored.astype(np.float32), query="OCCLUDED") < 0
+        sky = np.clip(0.35 + 0.65 * mirrored[:, 2], 0.1, 1) * fresnel * free
+        out = sky[:, None] * np.array([0.95, 1.0, 1.08])
+        for towards, colour in zip(*(a[:SUNS] for a in _lights()), strict=True):
+            half = towards - d
+            half /= np.linalg.norm(half, axis=1, keepdims=True)
+            glint = np.clip((n * half).sum(1), 0, 1) ** SHININESS * ((n @ towards) > 0)
+            lit = np.flatnonzero(glint > 0.01)
+            rays = np.broadcast_to(towards.astype(np.float32), (len(lit), 3)).copy()
+            lit = lit[self.scene.run(start[lit], rays, query="OCCLUDED") < 0]
+            out[lit] += 0.6 * glint[lit, None] * colour
+        return out
 
     def _window(self, camera: Camera) -> tuple[int, int, int, int]:
         """Pixels (x0, y0, width, height) that the object can touch; the whole picture if it is very near."""
