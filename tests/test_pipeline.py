@@ -24,7 +24,8 @@ from hingesplat.twin import Part, Twin
 
 @pytest.fixture(scope="module")
 def cabinet(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make("cabinet", tmp_path_factory.mktemp("made") / "cabinet", size=128, train_views=30, test_views=3)
+    out = tmp_path_factory.mktemp("made") / "cabinet"
+    return make("cabinet", out, size=128, train_views=30, test_views=3, below=0.125)
 
 
 @pytest.fixture(scope="module")

@@ -85,7 +85,7 @@ class Demo:
         started = time.perf_counter()
         capture, run = self.out / "capture", self.out / "run"
         if not (capture / "truth" / "meta.json").is_file():
-            Synth("cabinet", capture, size=200, views=60).run(console)
+            Synth("cabinet", capture, size=200, views=60, test_views=10, below=0.125).run(console)
         twin = _reconstruct(load_capture(capture), demo_config(), run, True, console)
         show_joints(console, twin)
         show_metrics(console, evaluate(run, capture / "truth"))
@@ -129,15 +129,21 @@ class Synth:
     """Make an articulated object and its photographs: a capture with its truth beside it."""
 
     name: tyro.conf.Positional[str]
-    """cabinet (a door and a drawer) or laptop."""
+    """What to make: docs/objects.png shows all; an unknown name lists them."""
     out: Path
     """Folder for the capture."""
     seed: int = 0
     """Draws shape, textures, joint values and cameras."""
     size: int = 400
     """Width and height of the pictures, pixels."""
-    views: int = 60
-    """Training views a state; ten more are test views."""
+    views: int = 100
+    """Training views a state."""
+    test_views: int = 20
+    """Test views a state."""
+    states: int = 2
+    """Those after the second have joint values between those of the first two."""
+    below: float = 0.0
+    """Share of the views that look up from slightly below; the others are on the upper hemisphere."""
     quiet: bool = False
     """Say nothing but warnings and errors."""
 
@@ -152,6 +158,9 @@ class Synth:
                 seed=self.seed,
                 size=self.size,
                 train_views=self.views,
+                test_views=self.test_views,
+                states=self.states,
+                below=self.below,
                 progress=lambda done, total: report(stage="synth", step=done, steps=total),
             )
         console.print(f"written: {escape(str(self.out))}", soft_wrap=True)

@@ -2,8 +2,20 @@
 
 import numpy as np
 
-from hingesplat.synth.model import Body, Hinge, Model, opening
-from hingesplat.synth.shapes import Solid, Texture, box, capsule, cylinder, extrude, glossy, lathe, open_box, rod, round_hole
+from hingesplat.synth.model import Body, Model, turning
+from hingesplat.synth.shapes import (
+    Solid,
+    Texture,
+    box,
+    capsule,
+    cylinder,
+    extrude,
+    glossy,
+    lathe,
+    open_box,
+    rod,
+    round_hole,
+)
 from hingesplat.synth.stuff import DARK, PALE, STEEL, Stuff, bar, knob
 from hingesplat.synth.textures import Colour, brushed, by_face, inlay, panes, plain, speckle, stripes
 
@@ -16,7 +28,7 @@ def _enamel(stuff: Stuff) -> Texture:
     if kind < 0.45:
         return plain(stuff.pale, stuff.seed(), 0.05, 0.2)
     if kind < 0.7:
-        return brushed(STEEL, 2, stuff.seed(), 0.12, 0.006)
+        return brushed(STEEL, 2, stuff.seed(), 0.06)
     return plain(stuff.paints[0], stuff.seed(), 0.06, 0.2)
 
 
@@ -68,12 +80,20 @@ def _cold_door(
         level = z[0] + 0.06 + i * (z[1] - z[0] - 0.08) / racks
         solids += open_box((-inside, back - 0.002, level), (inside, back + 0.075, level + 0.05), 0.006, white, white)
         solids += _bottles(stuff, (0.02 - inside, inside - 0.02), back + 0.036, level + 0.005, 0.14)
+    for i in range(int(stuff.rng.choice([0, 0, 3, 6]))):  # Notes under magnets, on some doors.
+        x, tall = stuff.rng.uniform(-0.6, 0.4) * w, stuff.rng.uniform(0.05, 0.08)
+        level = stuff.rng.uniform(z[0] + 0.1, z[1] - 0.2)
+        text = stripes(plain(stuff.pale, i), plain(stuff.paints[i], i), 2, 0.012, 0.4)
+        solids.append(box((x, face - 0.0015, level), (x + 0.06, face + 0.001, level + tall), text))
+        solids.append(
+            cylinder((x + 0.03, face, level + tall - 0.012), (0, -1, 0), 0.008, 0.008, stuff.paint(i + 1), 16)
+        )
+    logo = box((-0.03, face - 0.002, z[1] - 0.07), (0.03, face + 0.001, z[1] - 0.055), stuff.paint(1))
     length = min(0.5 * (z[1] - z[0]), 0.34)
     end = z[0] + 0.12 + length / 2 if z[0] > 0.5 else z[1] - 0.12 - length / 2
     handle = bar((-sign * (w - 0.05), face, end), (0, 0, 1), length, grip)
-    limit = float(np.radians(110))
-    hinge = Hinge("base", "revolute", (0, 0, sign), (sign * w, face, z[0]), (0.0, limit), opening(stuff.rng, limit))
-    return Body(name, (*glossy((slab, *handle)), *solids), hinge)
+    hinge = turning(stuff.rng, "base", (0, 0, sign), (sign * w, face, z[0]), 110)
+    return Body(name, (*glossy((slab, logo, *handle)), *solids), hinge)
 
 
 def _fridge(stuff: Stuff, name: str, doors: list[tuple[str, float]]) -> Model:
@@ -89,9 +109,7 @@ def _fridge(stuff: Stuff, name: str, doors: list[tuple[str, float]]) -> Model:
         base += glossy(_cold_room(stuff, w, d, (z, top), enamel, max(1, round(share * 3))), 0.5)
         movers.append(_cold_door(stuff, door, w, d, (z, top), right, enamel, grip))
         z = top
-    x = rng.uniform(-0.5, 0.1) * w
-    badge = box((x, -d + 0.02, z - 0.001), (x + 0.12, d - 0.06, z + 0.012), plain(stuff.paints[1], 5), 0.004)
-    return Model(name, (Body("base", (*base, badge)), *movers))
+    return Model(name, (Body("base", tuple(base)), *movers))
 
 
 def fridge(rng: np.random.Generator) -> Model:
@@ -106,7 +124,9 @@ def fridge3(rng: np.random.Generator) -> Model:
     return _fridge(Stuff(rng), "fridge3", doors if rng.random() < 0.5 else doors[::-1])
 
 
-def _oven(stuff: Stuff, w: tuple[float, float], d: float, z: tuple[float, float], skin: Texture, racks: int) -> list[Solid]:
+def _oven(
+    stuff: Stuff, w: tuple[float, float], d: float, z: tuple[float, float], skin: Texture, racks: int
+) -> list[Solid]:
     """A cavity of dark enamel with wire racks and a tray."""
     r, g, b = stuff.paints[1]
     dark: Colour = (0.25 + 0.1 * r, 0.25 + 0.1 * g, 0.27 + 0.1 * b)
@@ -138,16 +158,13 @@ def _oven_door(
     low, high = (w[0] + 0.004, face, z[0] + 0.004), (w[1] - 0.004, back, z[1] - 0.004)
     front = by_face(skin, f2=skin, f3=inlay(inner, glass, 1.2 * rim))
     frame, steel = box(low, high, front, 0.005), brushed(STEEL, 0, stuff.seed(), 0.15)
-    window = box(
-        (w[0] + rim, face - 0.003, z[0] + rim), (w[1] - rim, face + 0.001, z[1] - 1.5 * rim), glass, 0.002
-    )
+    window = box((w[0] + rim, face - 0.003, z[0] + rim), (w[1] - rim, face + 0.001, z[1] - 1.5 * rim), glass, 0.002)
     if down:
         grip = bar(((w[0] + w[1]) / 2, face, z[1] - 0.5 * rim - 0.015), (1, 0, 0), 0.8 * wide, steel, 0.03)
-        axis, origin, limit = (1, 0, 0), ((w[0] + w[1]) / 2, face, low[2]), float(np.radians(88))
+        hinge = turning(stuff.rng, "base", (1, 0, 0), ((w[0] + w[1]) / 2, face, low[2]), 88)
     else:
         grip = bar((w[0] + 0.5 * rim, face, (z[0] + z[1]) / 2), (0, 0, 1), 0.6 * tall, steel, 0.03)
-        axis, origin, limit = (0, 0, 1), (high[0], face, z[0]), float(np.radians(105))
-    hinge = Hinge("base", "revolute", axis, origin, (0.0, limit), opening(stuff.rng, limit))
+        hinge = turning(stuff.rng, "base", (0, 0, 1), (high[0], face, z[0]), 105)
     return Body(name, glossy((frame, window, *grip)), hinge)
 
 
@@ -160,7 +177,8 @@ def _hob(stuff: Stuff, w: float, d: float, z: float, columns: int) -> list[Solid
         x, y, r = cx * w, cy * d, stuff.rng.uniform(0.055, 0.075)
         ring = [(r, 0), (r, 0.012), (r - 0.014, 0.012), (r - 0.014, 0), (r, 0)]
         solids.append(lathe(ring, (x, y, z + 0.024), (0, 0, 1), iron, 40))
-        solids.append(cylinder((x, y, z + 0.024), (0, 0, 1), 0.5 * r, 0.008, plain(STEEL, 7, 0.1, 0.02)))
+        cap = (r - 0.001, 0.0125) if i == pot else (0.5 * r, 0.008)  # No hollow under a pot.
+        solids.append(cylinder((x, y, z + 0.024), (0, 0, 1), *cap, plain(STEEL, 7, 0.1, 0.02)))
         if i == pot:
             h, p = stuff.rng.uniform(0.09, 0.13), 1.15 * r
             wall = [(0, 0), (p, 0), (p, h), (p - 0.006, h), (p - 0.006, 0.01), (0, 0.01)]
@@ -180,7 +198,9 @@ def _knobs(stuff: Stuff, xs: np.ndarray, y: float, z: float, radius: float) -> l
     return [*glossy(solids), *marks]
 
 
-def _cooker(stuff: Stuff, name: str, w: float, h: float, doors: list[tuple[str, tuple[float, float], tuple[float, float], bool]]) -> Model:
+def _cooker(
+    stuff: Stuff, name: str, w: float, h: float, doors: list[tuple[str, tuple[float, float], tuple[float, float], bool]]
+) -> Model:
     """A cooker: ovens from z = 0.09 to ``h``, a panel with knobs, a hob. Doors: name, x, z, whether it drops."""
     rng = stuff.rng
     d, panel, skin = rng.uniform(0.26, 0.3), rng.uniform(0.09, 0.12), _enamel(stuff)
@@ -191,7 +211,9 @@ def _cooker(stuff: Stuff, name: str, w: float, h: float, doors: list[tuple[str, 
         *_knobs(stuff, np.linspace(-0.8 * w, 0.8 * w, round(w / 0.06)), -d - 0.02, h + 0.45 * panel, 0.2 * panel),
     ]
     base += [
-        cylinder((x, y, 0), (0, 0, 1), 0.022, 0.04, plain(DARK, 6), 20) for x in (0.06 - w, w - 0.06) for y in (0.07 - d, d - 0.07)
+        cylinder((x, y, 0), (0, 0, 1), 0.022, 0.04, plain(DARK, 6), 20)
+        for x in (0.06 - w, w - 0.06)
+        for y in (0.07 - d, d - 0.07)
     ]
     movers = []
     for door, x, z, down in doors:
@@ -238,33 +260,45 @@ def washer(rng: np.random.Generator) -> Model:
         box((-w, -d, h - 0.001), (w, d, h + 0.02), skin, 0.006),
     ]
     mid, face = top + 0.5 * panel, -d - 0.012
+    display = panes((0.05, 0.08, 0.12), (0.1, 0.2, 0.25), (0, 2), 0.006, stuff.seed())
     base += [
         box((0.02 - w, face - 0.006, top + 0.02), (0.19 - w, face + 0.001, h - 0.02), skin, 0.003),
-        box((0.10 - w, face - 0.009, top + 0.035), (0.17 - w, face - 0.005, top + 0.05), plain((0.6, 0.62, 0.65), 3), 0.001),
-        box((0.1, face - 0.003, mid - 0.03), (0.2, face + 0.001, mid + 0.03), panes((0.05, 0.08, 0.12), (0.1, 0.2, 0.25), (0, 2), 0.006, stuff.seed()), 0.001),
+        box((0.10 - w, face - 0.009, top + 0.035), (0.17 - w, face - 0.005, top + 0.05), grey, 0.001),
+        box((0.1, face - 0.003, mid - 0.03), (0.2, face + 0.001, mid + 0.03), display, 0.001),
         *_knobs(stuff, np.array([-0.02]), face, mid, 0.03),
-        *(cylinder((0.225, face + 0.001, mid + k * 0.028), (0, -1, 0), 0.008, 0.006, stuff.paint(k + 1), 20) for k in (-1, 0, 1)),
+        *(
+            cylinder((0.225, face + 0.001, mid + k * 0.028), (0, -1, 0), 0.008, 0.006, stuff.paint(k + 1), 20)
+            for k in (-1, 0, 1)
+        ),
     ]
-    base += [cylinder((x, y, 0), (0, 0, 1), 0.025, foot + 0.001, plain(DARK, 6), 20) for x in (0.06 - w, w - 0.06) for y in (0.06 - d, d - 0.06)]
+    base += [
+        cylinder((x, y, 0), (0, 0, 1), 0.025, foot + 0.001, plain(DARK, 6), 20)
+        for x in (0.06 - w, w - 0.06)
+        for y in (0.06 - d, d - 0.06)
+    ]
 
-    side = 1.0 if rng.random() < 0.3 else -1.0
-    back, thick, rim = -d - GAP, 0.035, hole + 0.045
-    chrome = brushed((0.78, 0.79, 0.81), 1, stuff.seed(), 0.1) if rng.random() < 0.6 else plain(stuff.paints[0], 3)
-    # One profile from the front's centre round the rim and back over the bowl, which reaches into the drum.
-    a, b, c = rim, hole - 0.03, hole - 0.055
-    front = [(0, -0.004), (0.5 * b, 0.0), (b, 0.012), (b + 0.008, 0.0), (a - 0.008, 0.0), (a, 0.008)]
-    behind = [(a, thick), (b, thick), (0.95 * b, thick + 0.03), (c, thick + 0.055), (0.6 * c, thick + 0.065), (0, thick + 0.068)]
-    glass, chrome_or = plain((0.16, 0.19, 0.22), stuff.seed(), 0.2), chrome
+    return Model("washer", (Body("base", glossy(base, 0.6)), _washer_door(stuff, hole, -d - GAP, z)))
 
-    def skin_of_door(x: np.ndarray, face_number: int) -> np.ndarray:
-        out = np.hypot(x[:, 0], x[:, 2] - z) > b + 0.004
-        return np.where(out[:, None], chrome_or(x, face_number), glass(x, face_number))
 
-    y = back - thick
-    disc = lathe([*front, *behind], (0, y, z), (0, 1, 0), skin_of_door, 96)
-    grip = box((-side * (rim - 0.01) - 0.014, y - 0.016, z - 0.05), (-side * (rim - 0.01) + 0.014, y + 0.012, z + 0.05), plain(DARK, 9), 0.005)
-    ear = sorted((side * (rim - 0.02), side * (rim + 0.012)))
-    strap = box((ear[0], y + 0.004, z - 0.04), (ear[1], back - 0.002, z + 0.04), chrome, 0.003)
-    limit = float(np.radians(120))
-    hinge = Hinge("base", "revolute", (0, 0, side), (side * (rim + 0.012), y, z), (0.0, limit), opening(rng, limit))
-    return Model("washer", (Body("base", glossy(base, 0.6)), Body("door", glossy((disc, grip, strap)), hinge)))
+def _washer_door(stuff: Stuff, hole: float, back: float, z: float) -> Body:
+    """A round door whose glass bowl reaches through a hole of that radius into the drum; its rear at y = ``back``."""
+    rng, thick, rim, bowl = stuff.rng, 0.035, hole + 0.045, hole - 0.03
+    side, y = 1.0 if rng.random() < 0.3 else -1.0, back - thick
+    frame = brushed((0.78, 0.79, 0.81), 1, stuff.seed(), 0.1) if rng.random() < 0.6 else plain(stuff.paints[0], 3)
+    glass = plain((0.16, 0.19, 0.22), stuff.seed(), 0.2)
+
+    def skin(x: np.ndarray, face: int) -> np.ndarray:
+        outside = np.hypot(x[:, 0], x[:, 2] - z) > bowl + 0.004
+        return np.where(outside[:, None], frame(x, face), glass(x, face))
+
+    # One profile from the front's centre round the rim and back over the bowl.
+    front = [(0, -0.004), (0.5 * bowl, 0), (bowl, 0.012), (bowl + 0.008, 0), (rim - 0.008, 0), (rim, 0.008)]
+    deep = [(1, 0), (0.95, 0.03), (0.8, 0.055), (0.5, 0.065), (0, 0.068)]
+    behind = [(rim, thick), *((r * bowl, thick + h) for r, h in deep)]
+    free = -side * (rim - 0.01)
+    solids = (
+        lathe([*front, *behind], (0, y, z), (0, 1, 0), skin, 96),
+        box((free - 0.014, y - 0.016, z - 0.05), (free + 0.014, y + 0.012, z + 0.05), plain(DARK, 9), 0.005),
+        box((side * (rim - 0.02), y + 0.004, z - 0.04), (side * (rim + 0.012), back - 0.002, z + 0.04), frame, 0.003),
+    )
+    return Body("door", glossy(solids), turning(rng, "base", (0, 0, side), (side * (rim + 0.012), y, z), 120))

@@ -1,10 +1,12 @@
 """Cupboards, tables and a chair."""
 
+from itertools import pairwise
+
 import numpy as np
 
-from hingesplat.synth.model import Body, Hinge, Model, ajar_and_open, opening
-from hingesplat.synth.shapes import Solid, Texture, box, cylinder, glossy, moved, rod, tube
-from hingesplat.synth.stuff import FRONT, GAP, Cell, Stuff, bar, compartment, finish, tint, vase
+from hingesplat.synth.model import Body, Hinge, Model, ajar_and_open, turning
+from hingesplat.synth.shapes import Solid, box, cylinder, glossy, moved, rod, tube
+from hingesplat.synth.stuff import FRONT, GAP, Cell, Kind, Stuff, bar, compartment, finish, tint, vase
 from hingesplat.synth.textures import by_face, checker, speckle, wood
 
 
@@ -37,9 +39,7 @@ def cabinet(rng: np.random.Generator) -> Model:
     )
 
     metal = wood(tint(rng, (0.8, 0.95), 0.1), tint(rng, (0.45, 0.55), 0.15), 1, s + 160, 0.02)
-    door_face = speckle(
-        tint(rng, (0.7, 0.9), 0.35), tint(rng, (0.35, 0.5), 0.5), rng.uniform(0.016, 0.026), s + 200
-    )
+    door_face = speckle(tint(rng, (0.7, 0.9), 0.35), tint(rng, (0.35, 0.5), 0.5), rng.uniform(0.016, 0.026), s + 200)
     door_back = checker(tint(rng, (0.8, 0.95), 0.3), tint(rng, (0.45, 0.6), 0.4), 0.055, s + 240)
     left = bool(rng.random() < 0.5)
     sign = -1.0 if left else 1.0  # The side of the hinge; the handle lies on the other.
@@ -86,7 +86,12 @@ def cabinet(rng: np.random.Generator) -> Model:
 
 
 def _piece(
-    name: str, stuff: Stuff, frame: tuple[Solid, ...], cells: list[Cell], y: tuple[float, float], fronts: tuple[int, ...]
+    name: str,
+    stuff: Stuff,
+    frame: tuple[Solid, ...],
+    cells: list[Cell],
+    y: tuple[float, float],
+    fronts: tuple[int, ...],
 ) -> Model:
     """A piece of furniture: a frame and what its cells hold, in one finish."""
     style = finish(stuff, fronts)
@@ -102,7 +107,9 @@ def _corpus(stuff: Stuff, x: tuple[float, float], y: tuple[float, float], z: tup
     """Sides and a top around cells, on four feet."""
     t, front = 0.018, y[0] - GAP - FRONT
     sides = (box((a, y[0], z[0]), (a + t, y[1], z[1]), stuff.wood(2)) for a in (x[0] - t, x[1]))
-    top = box((x[0] - t - 0.01, front - 0.006, z[1] + 0.002), (x[1] + t + 0.01, y[1], z[1] + 0.026), stuff.wood(0), 0.004)
+    top = box(
+        (x[0] - t - 0.01, front - 0.006, z[1] + 0.002), (x[1] + t + 0.01, y[1], z[1] + 0.026), stuff.wood(0), 0.004
+    )
     plate = box((x[0], y[0], z[1] - 0.001), (x[1], y[1], z[1] + 0.003), stuff.wood(0))
     feet = (
         cylinder((a, b, 0), (0, 0, 1), 0.02, z[0] + 0.001, stuff.metal(2), 20)
@@ -154,11 +161,14 @@ def storage7(rng: np.random.Generator) -> Model:
     stuff = Stuff(rng)
     w, d, h, foot = rng.uniform(0.42, 0.5), rng.uniform(0.19, 0.23), rng.uniform(0.9, 1.05), 0.05
     a, b, y = foot + h * rng.uniform(0.36, 0.42), foot + h * rng.uniform(0.56, 0.62), (-d, d)
-    cells = [
-        Cell(f"{kind}_{level}_{side}", kind if kind == "drawer" else side, (-w, 0) if side == "left" else (0, w), z)
-        for kind, level, z in (("door", "low", (foot, a)), ("drawer", "middle", (a, b)), ("door", "high", (b, foot + h)))
-        for side in ("left", "right")
-    ]
+    cells = []
+    sides: tuple[tuple[Kind, tuple[float, float]], ...] = (("left", (-w, 0)), ("right", (0, w)))
+    for side, x in sides:
+        cells += [
+            Cell(f"door_low_{side}", side, x, (foot, a)),
+            Cell(f"drawer_{side}", "drawer", x, (a, b)),
+            Cell(f"door_high_{side}", side, x, (b, foot + h)),
+        ]
     return _piece("storage7", stuff, _corpus(stuff, (-w, w), y, (foot, foot + h)), cells, y, (0, 1, 2))
 
 
@@ -184,14 +194,19 @@ def table4(rng: np.random.Generator) -> Model:
         edges = np.linspace(foot, top, 4) + np.array([0, *rng.uniform(0, 0.04, 2), 0])
         span = (w - x, w - 0.02) if side > 0 else (0.02 - w, x - w)
         cells = [Cell(f"drawer_{i}", "drawer", span, (edges[i], edges[i + 1])) for i in range(3)]
-        feet = [box((a, b, 0), (a + 0.03, b + 0.03, foot), stuff.wood(2)) for a in (span[0], span[1] - 0.03) for b in (y[0], y[1] - 0.03)]
+        feet = [
+            box((a, b, 0), (a + 0.03, b + 0.03, foot), stuff.wood(2))
+            for a in (span[0], span[1] - 0.03)
+            for b in (y[0], y[1] - 0.03)
+        ]
         frame = (*_desk(stuff, w, d, h, [-side * (w - 0.05)]), *feet)
     else:
         edges = np.linspace(0.08 - w, w - 0.08, 4) + np.array([0, *rng.uniform(-0.04, 0.04, 2), 0])
         low = top - rng.uniform(0.13, 0.18)
         cells = [Cell(f"drawer_{i}", "drawer", (edges[i], edges[i + 1]), (low, top)) for i in range(3)]
         frame = _desk(stuff, w, d, h, [0.05 - w, w - 0.05])
-    return _piece("table4", stuff, (*frame, *vase(stuff, 0.3 * w, 0.3 * d, h, rng.uniform(0.16, 0.24))), cells, y, (0, 1, 2))
+    things = vase(stuff, 0.3 * w, 0.3 * d, h, rng.uniform(0.16, 0.24))
+    return _piece("table4", stuff, (*frame, *things), cells, y, (0, 1, 2))
 
 
 def table5(rng: np.random.Generator) -> Model:
@@ -212,24 +227,25 @@ def table5(rng: np.random.Generator) -> Model:
 def latchdoor(rng: np.random.Generator) -> Model:
     """A wall cupboard whose door carries a lever that turns on the door."""
     stuff = Stuff(rng)
-    stuff.pull = 2
     w, d, h, foot = rng.uniform(0.26, 0.34), rng.uniform(0.16, 0.22), rng.uniform(0.55, 0.7), 0.05
-    side, y = ("left", "right")[int(rng.integers(2))], (-d, d)
-    model = _piece("latchdoor", stuff, _corpus(stuff, (-w, w), y, (foot, foot + h)), [Cell("door", side, (-w, w), (foot, foot + h))], y, (0, 2, 3))
-    base, door = model.bodies
+    side: Kind = "left" if rng.random() < 0.5 else "right"
+    y = (-d, d)
+    frame, cell = _corpus(stuff, (-w, w), y, (foot, foot + h)), Cell("door", side, (-w, w), (foot, foot + h))
+    base, door = _piece("latchdoor", stuff, frame, [cell], y, (0, 2, 3)).bodies
     inward = 1.0 if side == "left" else -1.0  # From the hinge towards the free edge.
     x, z, face = inward * (w - 0.06), foot + h * rng.uniform(0.42, 0.55), -d - GAP - FRONT
     metal = stuff.metal(0)
     plate = box((x - 0.025, face - 0.006, z - 0.07), (x + 0.025, face + 0.001, z + 0.07), stuff.metal(2), 0.003)
-    length, thick, y0 = rng.uniform(0.14, 0.19), 0.014, face - 0.010
-    path = np.array([[0, 0], [0, -0.05], [-0.008, -0.062], [-0.02, -0.066], [-length, -0.066]])
+    length, y0 = rng.uniform(0.14, 0.19), face - 0.010
+    bend = np.array([[0, 0], [0, -0.05], [0.008, -0.062], [0.02, -0.066], [length, -0.066]])
+    path = np.column_stack([x - inward * bend[:, 0], y0 - 0.012 + bend[:, 1], np.full(len(bend), z)])
     lever = (
-        tube(np.column_stack([x + inward * path[:, 0], y0 - 0.012 + path[:, 1], np.full(5, z)]), (0, 0, 1), thick, metal),
+        tube(path, (0, 0, 1), 0.014, metal),
         cylinder((x, y0, z), (0, -1, 0), 0.024, 0.012, metal),
     )
-    limit = float(np.radians(75))
-    turn = Hinge("door", "revolute", (0, inward, 0), (x, face, z), (0.0, limit), opening(rng, limit))
-    return Model("latchdoor", (base, Body("door", (door.solids[0], *glossy((plate,))), door.hinge), Body("latch", glossy(lever), turn)))
+    turn = turning(rng, "door", (0, inward, 0), (x, face, z), 75)
+    door = Body("door", (door.solids[0], *glossy((plate,))), door.hinge)  # Without the usual handle.
+    return Model("latchdoor", (base, door, Body("latch", glossy(lever), turn)))
 
 
 def foldchair(rng: np.random.Generator) -> Model:
@@ -249,7 +265,8 @@ def foldchair(rng: np.random.Generator) -> Model:
     arch = [(-w, rail(r), r), *((-w, rail(z), z) for z in np.linspace(0.2, h - 0.06, 5))]
     arch += [(x, rail(z), z) for x, z in ((0.03 - w, h - 0.015), (0.07 - w, h))]
     arch += [(-x, y, z) for x, y, z in reversed(arch)]
-    plane = np.array([0, -h, lean]) / np.hypot(h, lean)
+    along = np.array([0, lean, h]) / np.hypot(h, lean)
+    plane = np.array([0, -along[2], along[1]])
     inner, top = w - 3.2 * r, seat - 0.04
     frame = [tube(np.array(arch), (plane[0], plane[1], plane[2]), r, metal), across(w, rail(0.13), 0.13)]
     reach = rail(seat) - rng.uniform(0.15, 0.18)  # Where the rear legs carry the front of the seat.
@@ -258,12 +275,12 @@ def foldchair(rng: np.random.Generator) -> Model:
         x = side * inner
         frame.append(rod((x, rear, r), (x, reach, top), r, metal, 20))
         # The bolt where a leg crosses its rail.
-        z = r + (rear - rail(r)) / (lean / h + (rear - reach) / (top - r)) * 1.0
+        z = r + (rear - rail(r)) / (lean / h + (rear - reach) / (top - r))
         frame.append(rod((x, rail(z), z), (side * w, rail(z), z), 0.7 * r, metal, 16))
     frame += [across(inner, reach, top), across(inner, rear - (rear - reach) * 0.2, r + (top - r) * 0.2)]
     slats = int(rng.integers(2, 4))
     tilt = np.eye(4)
-    tilt[:3, :3] = np.column_stack([[1, 0, 0], -plane, [0, lean / np.hypot(h, lean), h / np.hypot(h, lean)]])
+    tilt[:3, :3] = np.column_stack([[1, 0, 0], -plane, along])
     for i in range(slats):
         z = h - 0.1 - i * 0.28 / slats
         tilt[:3, 3] = 0, rail(z), z
@@ -272,9 +289,15 @@ def foldchair(rng: np.random.Generator) -> Model:
 
     half, y0, y1 = inner - r - 0.006, rail(seat) - 0.34, rail(seat) + 0.045
     edges = np.linspace(y0, y1, int(rng.integers(4, 7)))
-    boards = [box((-half, a + 0.003, seat), (half, b - 0.003, seat + 0.016), stuff.wood(0), 0.004) for a, b in zip(edges, edges[1:], strict=False)]
-    ribs = [box((x - 0.012, y0 + 0.01, seat - 0.016), (x + 0.012, y1 - 0.01, seat + 0.002), metal) for x in (0.03 - half, half - 0.03)]
+    boards = [
+        box((-half, a + 0.003, seat), (half, b - 0.003, seat + 0.016), stuff.wood(0), 0.004) for a, b in pairwise(edges)
+    ]
+    ribs = [
+        box((x - 0.012, y0 + 0.01, seat - 0.016), (x + 0.012, y1 - 0.01, seat + 0.002), metal)
+        for x in (0.03 - half, half - 0.03)
+    ]
     pin = rod((0.014 - w + r, rail(seat), seat - 0.004), (w - r - 0.014, rail(seat), seat - 0.004), 0.008, metal, 16)
-    limit = float(np.radians(50))
-    fold = Hinge("base", "revolute", (-1, 0, 0), (0, rail(seat), seat - 0.004), (0.0, limit), opening(rng, limit))
-    return Model("foldchair", (Body("base", tuple(frame)), Body("seat", (*boards, *ribs, pin), fold)))
+    fold = turning(rng, "base", (-1, 0, 0), (0, rail(seat), seat - 0.004), 50)
+    return Model(
+        "foldchair", (Body("base", glossy(frame, 0.5)), Body("seat", glossy((*boards, *ribs, pin), 0.5), fold))
+    )

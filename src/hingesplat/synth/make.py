@@ -19,6 +19,8 @@ from hingesplat.synth.shapes import solid_mesh
 from hingesplat.synth.trace import LitScene, Surface
 
 FIELD_OF_VIEW = np.radians(45)
+TEXELS = 16
+"""At most so many a pixel of a picture, on all surfaces together."""
 
 
 def make(
@@ -63,7 +65,7 @@ def make(
     tmp = out.with_name(out.name + ".tmp")
     shutil.rmtree(tmp, ignore_errors=True)
     try:
-        surface = Surface(model, 0.6 / size / scale)
+        surface = Surface(model, fine_texel(model, size, scale))
         rng = np.random.default_rng((CAMERAS, seed))
         total, done = states * (train_views + test_views), 0
         for state in range(states):
@@ -92,6 +94,12 @@ def make(
     finally:
         shutil.rmtree(tmp, ignore_errors=True)
     return out
+
+
+def fine_texel(model: Model, size: int, scale: float) -> float:
+    """Edge of a texel, model units: 0.6 units of the box / ``size``, more where that would need too many texels."""
+    area = sum(p.size[0] * p.size[1] for body in model.bodies for solid in body.solids for p in solid)
+    return max(0.6 / scale, float(np.sqrt(area / TEXELS))) / size
 
 
 def cameras_around(

@@ -71,9 +71,23 @@ class Model:
         return self.poses(self.values(index))
 
 
-def opening(rng: np.random.Generator, limit: float) -> tuple[float, float]:
-    """Two values in [0, limit], a fifth to nine tenths of it apart; either may be the open one, neither need be shut."""
-    size = limit * rng.uniform(0.2, 0.9)
+Point = tuple[float, float, float]
+
+
+def turning(rng: np.random.Generator, parent: str, axis: Point, origin: Point, degrees: float) -> Hinge:
+    """A revolute joint from 0 to ``degrees``, its values in the two states drawn."""
+    limit = float(np.radians(degrees))
+    return Hinge(parent, "revolute", axis, origin, (0.0, limit), _opening(rng, limit))
+
+
+def sliding(rng: np.random.Generator, parent: str, axis: Point, origin: Point, travel: float) -> Hinge:
+    """A prismatic joint from 0 to ``travel`` model units, its values in the two states drawn."""
+    return Hinge(parent, "prismatic", axis, origin, (0.0, travel), _opening(rng, travel))
+
+
+def _opening(rng: np.random.Generator, limit: float) -> tuple[float, float]:
+    """Two values in [0, limit], a quarter to nine tenths of it apart; either may be the open one, shut or not."""
+    size = limit * rng.uniform(0.25, 0.9)
     low = rng.choice([0.0, rng.uniform(0, limit - size)], p=[0.3, 0.7])
     a, b = float(low), float(low + size)
     return (b, a) if rng.random() < 0.35 else (a, b)

@@ -66,8 +66,11 @@ def solid_mesh(solid: Solid) -> trimesh.Trimesh:
 def box(
     low: tuple[float, float, float], high: tuple[float, float, float], texture: Texture, radius: float = 0.0
 ) -> Solid:
-    """An axis-aligned box, its edges rounded by ``radius``; its faces are numbered −x, +x, −y, +y, −z, +z."""
-    lo, hi = np.asarray(low, float), np.asarray(high, float)
+    """An axis-aligned box between two opposite corners, its edges rounded by ``radius``.
+
+    Its faces are numbered −x, +x, −y, +y, −z, +z.
+    """
+    lo, hi = np.minimum(low, high, dtype=float), np.maximum(low, high, dtype=float)
     bend = radius * (1 - np.tan(np.linspace(np.pi / 4, 0, 4)))  # Equal angles from the edge to the flat.
 
     def lines(size: float) -> np.ndarray:
@@ -148,7 +151,7 @@ def tube(
 
     ``normal`` is that of the plane; two radii are those along it and across it.
     """
-    a, b = (radius, radius) if isinstance(radius, float) else radius
+    a, b = radius if isinstance(radius, tuple) else (radius, radius)
     p, up = np.asarray(path, float), np.asarray(normal, float)
     if closed:
         tangents = np.roll(p, -1, 0) - np.roll(p, 1, 0)
@@ -213,9 +216,13 @@ def cylinder(
 
 
 def rod(
-    start: tuple[float, float, float], end: tuple[float, float, float], radius: float, texture: Texture, around: int = 12
+    start: tuple[float, float, float],
+    end: tuple[float, float, float],
+    radius: float,
+    texture: Texture,
+    around: int = 12,
 ) -> Solid:
-    """A wire or leg with bevelled ends, which lie at ``start`` and ``end``; no lines between them, unlike ``capsule``."""
+    """A wire or leg whose bevelled ends lie at ``start`` and ``end``; far fewer triangles than ``capsule``."""
     way = np.asarray(end, float) - np.asarray(start)
     length = float(np.linalg.norm(way))
     return cylinder(start, _point(way / length), radius, length, texture, around)
@@ -230,9 +237,12 @@ def extrude(
     from its middle; ``hole`` has as many points, each seen from its fellow of the outline. Faces: 2 · axis is
     the low end, 2 · axis + 1 the high end, 6 the rim, 7 the wall of the hole.
     """
-    outer = np.vstack([outline, outline[:1]])
-    inner = np.tile((outline.min(0) + outline.max(0)) / 2, (len(outer), 1)) if hole is None else np.vstack([hole, hole[:1]])
+    fellow = np.tile((outline.min(0) + outline.max(0)) / 2, (len(outline), 1)) if hole is None else hole
+    outer, inner = (np.vstack([line, line[:1]]) for line in (outline, fellow))
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(outer, axis=0), axis=1))])
+    # Short steps: within a cell of a ruled surface, mesh and texture agree only nearly.
+    steps = np.union1d(length, np.linspace(0, length[-1], 49)[1:-1])
+    outer, inner, length = _interp(steps, length, outer), _interp(steps, length, inner), steps
     width = float(np.linalg.norm(outer - inner, axis=1).max())
 
     def patch(a: np.ndarray, za: float, b: np.ndarray, zb: float, size: float, face: int) -> Patch:

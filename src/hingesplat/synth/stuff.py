@@ -5,10 +5,9 @@ from typing import Literal
 
 import numpy as np
 
-from hingesplat.synth.model import Body, Hinge, opening
-from hingesplat.synth.shapes import Solid, box, capsule, cylinder, glossy, lathe, open_box, tube
+from hingesplat.synth.model import Body, sliding, turning
+from hingesplat.synth.shapes import Solid, Texture, box, capsule, glossy, lathe, open_box, tube
 from hingesplat.synth.textures import Colour, brushed, by_face, checker, inlay, plain, speckle, stripes, wood
-from hingesplat.synth.shapes import Texture
 
 WOODS: tuple[tuple[Colour, Colour], ...] = (
     ((0.87, 0.74, 0.55), (0.68, 0.50, 0.31)),  # Oak.
@@ -42,10 +41,11 @@ def tint(rng: np.random.Generator, brightness: tuple[float, float], saturation: 
 
 
 class Stuff:
-    """The materials of one object: one wood, two paints that go together, one metal, drawn from a seed."""
+    """The materials of one object, drawn from a seed: one wood, one metal, paints in order of use, one handle."""
 
-    def __init__(self, rng: np.random.Generator) -> None:
-        self.rng = rng
+    def __init__(self, rng: np.random.Generator, size: float = 1.0) -> None:
+        """``size`` is that of the object, metres: patterns are so much finer."""
+        self.rng, self.size = rng, size
         self.light, self.dark = WOODS[rng.integers(len(WOODS))]
         self.paints = [PAINTS[i] for i in rng.permutation(len(PAINTS))]
         self.pale: Colour = PALE[rng.integers(len(PALE))]
@@ -56,14 +56,14 @@ class Stuff:
         return int(self.rng.integers(1 << 20))
 
     def wood(self, grain: int, scale: float = 0.07) -> Texture:
-        return wood(self.light, self.dark, grain, self.seed(), scale)
+        return wood(self.light, self.dark, grain, self.seed(), scale * self.size)
 
     def paint(self, which: int = 0) -> Texture:
         """Nearly uniform."""
-        return plain(self.paints[which], self.seed())
+        return plain(self.paints[which], self.seed(), size=0.1 * self.size)
 
     def metal(self, axis: int = 0) -> Texture:
-        return brushed(self.metal_colour, axis, self.seed())
+        return brushed(self.metal_colour, axis, self.seed(), size=0.004 * self.size)
 
     def front(self, kind: int, grain: int, which: int = 0) -> Texture:
         """What a door or drawer shows: 0 a panel in a wooden frame, 1 wood, 2 a speckled paint, 3 plain paint."""
@@ -75,8 +75,8 @@ class Stuff:
             case 2:
                 colour = np.asarray(self.paints[which])
                 r, g, b = np.clip(0.45 * colour + 0.5, 0, 1)
-                return speckle(self.paints[which], (r, g, b), 0.012, self.seed(), 0.25)
-        return inlay(self.paint(which), self.paint(which), 0.03)
+                return speckle(self.paints[which], (r, g, b), 0.012 * self.size, self.seed(), 0.25)
+        return self.paint(which)
 
     def lining(self) -> Texture:
         """Patterned paper inside."""
@@ -118,7 +118,9 @@ def knob(foot: tuple[float, float, float], radius: float, texture: Texture) -> S
     return lathe([(r * radius, h * radius) for r, h in shape], foot, (0, -1, 0), texture, 24)
 
 
-def pull(stuff: Stuff, foot: tuple[float, float, float], along: tuple[int, int, int], length: float) -> tuple[Solid, ...]:
+def pull(
+    stuff: Stuff, foot: tuple[float, float, float], along: tuple[int, int, int], length: float
+) -> tuple[Solid, ...]:
     """The handle that all fronts of one piece of furniture share."""
     metal = stuff.metal(1)
     match stuff.pull:
@@ -131,7 +133,17 @@ def pull(stuff: Stuff, foot: tuple[float, float, float], along: tuple[int, int, 
 
 def vase(stuff: Stuff, x: float, y: float, z: float, height: float) -> tuple[Solid, ...]:
     """A glazed vase on a table."""
-    shape = [(0, 0), (0.22, 0), (0.3, 0.12), (0.34, 0.3), (0.3, 0.5), (0.17, 0.75), (0.15, 0.85), (0.2, 1), (0.12, 0.98)]
+    shape = [
+        (0, 0),
+        (0.22, 0),
+        (0.3, 0.12),
+        (0.34, 0.3),
+        (0.3, 0.5),
+        (0.17, 0.75),
+        (0.15, 0.85),
+        (0.2, 1),
+        (0.12, 0.98),
+    ]
     glaze = stripes(stuff.front(2, 0, 1), stuff.paint(2), 2, height, 0.2, z + 0.35 * height)
     turned = [(r * height, h * height) for r, h in (*shape, (0.1, 0.85), (0, 0.8))]
     return glossy((lathe(turned, (x, y, z), (0, 0, 1), glaze, 40),), 0.8)
@@ -182,7 +194,9 @@ def finish(stuff: Stuff, fronts: tuple[int, ...] = (0, 1, 2, 3)) -> Finish:
     return Finish(int(stuff.rng.choice(fronts)), stuff.wood(2), stuff.lining())
 
 
-def compartment(stuff: Stuff, style: Finish, cell: Cell, y: tuple[float, float]) -> tuple[tuple[Solid, ...], Body | None]:
+def compartment(
+    stuff: Stuff, style: Finish, cell: Cell, y: tuple[float, float]
+) -> tuple[tuple[Solid, ...], Body | None]:
     """The boards of a cell between the depths ``y``, and the moving front with its hinge."""
     (x0, x1), (z0, z1), (y0, y1) = cell.x, cell.z, y
     carcass = open_box((x0, y0, z0), (x1, y1, z1), BOARD, style.carcass, style.lining, face=2)
@@ -201,7 +215,7 @@ def compartment(stuff: Stuff, style: Finish, cell: Cell, y: tuple[float, float])
         slab = box(low, high, by_face(stuff.front(style.front, 0), f3=stuff.wood(0)), 0.004)
         grip = pull(stuff, (middle, face, (z0 + z1) / 2), (1, 0, 0), min(0.4 * wide, 0.22))
         travel = 0.72 * (y1 - y0)
-        hinge = Hinge("base", "prismatic", (0, -1, 0), (middle, face, z0), (0.0, travel), opening(stuff.rng, travel))
+        hinge = sliding(stuff.rng, "base", (0, -1, 0), (middle, face, z0), travel)
         return carcass, Body(cell.name, (slab, *tray, *grip), hinge)
     if b > 0.3:
         shelf = z0 + stuff.rng.uniform(0.42, 0.58) * (z1 - z0)
@@ -210,7 +224,6 @@ def compartment(stuff: Stuff, style: Finish, cell: Cell, y: tuple[float, float])
     slab = box(low, high, by_face(stuff.front(style.front, 2), f3=stuff.wood(2)), 0.004)
     edge = middle + sign * (wide / 2 - SEAM)
     grip = pull(stuff, (middle - sign * (wide / 2 - 0.045), face, (z0 + z1) / 2), (0, 0, 1), min(0.4 * (z1 - z0), 0.16))
-    limit = float(np.radians(105))
     # Hinged at its outer edge a door stays within its own width, whatever its neighbours do.
-    hinge = Hinge("base", "revolute", (0, 0, sign), (edge, face, z0), (0.0, limit), opening(stuff.rng, limit))
+    hinge = turning(stuff.rng, "base", (0, 0, sign), (edge, face, z0), 105)
     return carcass, Body(cell.name, (slab, *grip), hinge)

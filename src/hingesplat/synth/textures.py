@@ -5,6 +5,7 @@ number of the face, which shifts and tints it, so that no two faces look alike.
 """
 
 import numpy as np
+from numba import njit
 
 from hingesplat.synth.shapes import Texture
 
@@ -26,16 +27,37 @@ def _hash(i: np.ndarray, j: np.ndarray, k: np.ndarray, seed: int) -> np.ndarray:
 
 def noise(x: np.ndarray, seed: int) -> np.ndarray:
     """Value noise in [0, 1] with cells of size 1: trilinear between hashed lattice values, (n, 3) to (n,)."""
-    floor = np.floor(x)
-    f = (x - floor).astype(np.float32)
-    f = f * f * (3 - 2 * f)
-    i = floor.astype(np.int32)
-    total = np.zeros(len(x), np.float32)
-    for corner in np.ndindex(2, 2, 2):
-        a, b, c = np.where(np.asarray(corner, bool), f, 1 - f).T
-        weight = a * b * c
-        total += weight * _hash(i[:, 0] + corner[0], i[:, 1] + corner[1], i[:, 2] + corner[2], seed)
-    return total
+    out = np.empty(len(x), np.float32)
+    _noise(np.ascontiguousarray(x, np.float64), np.uint32((seed * 0x9E3779B1) & 0xFFFFFFFF), out)
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _noise(x: np.ndarray, salt: np.uint32, out: np.ndarray) -> None:
+    for n in range(len(x)):
+        total = np.float32(0)
+        c0, c1, c2 = np.floor(x[n, 0]), np.floor(x[n, 1]), np.floor(x[n, 2])
+        f0, f1, f2 = _smooth(x[n, 0] - c0), _smooth(x[n, 1] - c1), _smooth(x[n, 2] - c2)
+        for a in range(2):
+            for b in range(2):
+                for c in range(2):
+                    h = np.uint32(np.uint32(np.int64(c0) + a) * np.uint32(0x8DA6B343))
+                    h ^= np.uint32(np.uint32(np.int64(c1) + b) * np.uint32(0xD8163841))
+                    h ^= np.uint32(np.uint32(np.int64(c2) + c) * np.uint32(0xCB1AB31F))
+                    h = np.uint32(h ^ salt)
+                    h = np.uint32(np.uint32(h ^ (h >> 15)) * np.uint32(0x2C1B3C6D))
+                    h = np.uint32(np.uint32(h ^ (h >> 12)) * np.uint32(0x297A2D39))
+                    h = np.uint32(h ^ (h >> 15))
+                    w = (f0 if a else np.float32(1) - f0) * (f1 if b else np.float32(1) - f1)
+                    w *= f2 if c else np.float32(1) - f2
+                    total += w * (np.float32(h >> 8) * np.float32(2**-24))
+        out[n] = total
+
+
+@njit(cache=True, inline="always")
+def _smooth(t: float) -> np.float32:
+    f = np.float32(t)
+    return f * f * (np.float32(3) - np.float32(2) * f)
 
 
 def fractal(x: np.ndarray, seed: int, octaves: int = 3) -> np.ndarray:
@@ -107,7 +129,7 @@ def plain(colour: Colour, seed: int, depth: float = 0.08, size: float = 0.1) -> 
     return texture
 
 
-def brushed(colour: Colour, axis: int, seed: int, depth: float = 0.25, size: float = 0.004) -> Texture:
+def brushed(colour: Colour, axis: int, seed: int, depth: float = 0.12, size: float = 0.004) -> Texture:
     """Metal with fine scratches along ``axis``."""
     stretch = np.full(3, 1.0)
     stretch[axis] = 0.03

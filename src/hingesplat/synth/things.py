@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hingesplat.synth.model import Body, Hinge, Model, ajar_and_open, opening
+from hingesplat.synth.model import Body, Hinge, Model, ajar_and_open, sliding, turning
 from hingesplat.synth.shapes import Solid, box, capsule, cylinder, extrude, glossy, open_box, tube
 from hingesplat.synth.stuff import DARK, STEEL, Stuff, tint
 from hingesplat.synth.textures import brushed, by_face, checker, panes, plain, speckle, stripes, wood
@@ -45,7 +45,7 @@ def laptop(rng: np.random.Generator) -> Model:
 
 def scissor(rng: np.random.Generator) -> Model:
     """Scissors that lie flat: two blades on a pivot, each with a loop for the fingers."""
-    stuff = Stuff(rng)
+    stuff = Stuff(rng, 0.2)
     blade, shank, t = rng.uniform(0.1, 0.13), rng.uniform(0.05, 0.065), rng.uniform(0.005, 0.0065)
     gap, wide, rod = 0.0009, rng.uniform(0.014, 0.018), rng.uniform(0.0055, 0.007)
     middle = t + gap / 2 + 0.001  # Height of the loops, which are as thick as both blades.
@@ -63,14 +63,13 @@ def scissor(rng: np.random.Generator) -> Model:
         ring = tube(loop, (0, 0, 1), (middle, rod), plastic, closed=True)
         halves.append(glossy((steel, extrude(handle, 2, low - 0.0002 * mirror, low + t, plastic), ring), 0.8))
     screw = cylinder((0, 0, middle + gap / 2 + t - 0.0005), (0, 0, 1), 0.0055, 0.0025, stuff.metal(0))
-    limit = float(np.radians(75))
-    hinge = Hinge("base", "revolute", (0, 0, -1), (0, 0, 0), (0.0, limit), opening(rng, limit))
+    hinge = turning(rng, "base", (0, 0, -1), (0, 0, 0), 75)
     return Model("scissor", (Body("base", halves[0]), Body("blade", (*halves[1], *glossy((screw,))), hinge)))
 
 
 def _stapler(rng: np.random.Generator, name: str, middle: bool) -> Model:
     """A stapler along x, hinged at its rear (+x): base, magazine and arm, the last two one piece or two."""
-    stuff = Stuff(rng)
+    stuff = Stuff(rng, 0.2)
     nose, w, gap = rng.uniform(0.075, 0.095), rng.uniform(0.0135, 0.0165), 0.0008
     skin = stuff.paint(0) if rng.random() < 0.6 else stuff.front(2, 0)
     steel, rubber = brushed(STEEL, 0, stuff.seed(), 0.12, 0.001), plain(DARK, 1, 0.15, 0.01)
@@ -84,7 +83,9 @@ def _stapler(rng: np.random.Generator, name: str, middle: bool) -> Model:
     def cheek(y: float, centre: np.ndarray, foot: float, radius: float, thick: float) -> Solid:
         turn = np.linspace(0, np.pi, 13)
         round_top = [(centre[0] - radius * np.cos(a), centre[1] + radius * np.sin(a)) for a in turn]
-        return extrude(profile([*round_top, (rear + radius, foot), (rear - radius, foot)]), 1, y - thick / 2, y + thick / 2, steel)
+        return extrude(
+            profile([*round_top, (rear + radius, foot), (rear - radius, foot)]), 1, y - thick / 2, y + thick / 2, steel
+        )
 
     base = [
         box((-nose - 0.008, -w - 0.004, 0.0015), (rear + 0.016, w + 0.004, low), skin, 0.0035),
@@ -97,12 +98,31 @@ def _stapler(rng: np.random.Generator, name: str, middle: bool) -> Model:
     z0, z1 = low + 0.006, low + 0.0155
     magazine = [
         *open_box((-nose, -0.0085, z0), (rear - 0.012, 0.0085, z1), 0.0012, steel, plain((0.3, 0.3, 0.32), 2)),
-        box((-nose + 0.002, -0.006, z0 + 0.001), (rear - 0.045, 0.006, z1 - 0.002), stripes(plain((0.82, 0.82, 0.85), 3), plain((0.5, 0.5, 0.53), 4), 0, 0.0016)),
+        box(
+            (-nose + 0.002, -0.006, z0 + 0.001),
+            (rear - 0.045, 0.006, z1 - 0.002),
+            stripes(plain((0.82, 0.82, 0.85), 3), plain((0.5, 0.5, 0.53), 4), 0, 0.0016),
+        ),
         box((rear - 0.0135, -side, z0), (rear + 0.006, side, pin[1] - 0.002), steel, 0.002),
     ]
     bottom = z1 + 0.0012
-    crown = [(-nose - 0.003, bottom), (-nose - 0.004, top - 0.013), (-nose + 0.006, top - 0.005), (-0.3 * nose, top), (0.3 * rear, top - 0.001), (rear - 0.016, top - 0.006), (rear - 0.013, bottom)]
-    tongue = [(rear - 0.026, bottom), (rear - 0.026, top - 0.006), (rear + 0.004, over[1] + 0.006), (rear + 0.008, over[1]), (rear + 0.004, over[1] - 0.004), (rear - 0.013, bottom)]
+    crown = [
+        (-nose - 0.003, bottom),
+        (-nose - 0.004, top - 0.013),
+        (-nose + 0.006, top - 0.005),
+        (-0.3 * nose, top),
+        (0.3 * rear, top - 0.001),
+        (rear - 0.016, top - 0.006),
+        (rear - 0.013, bottom),
+    ]
+    tongue = [
+        (rear - 0.026, bottom),
+        (rear - 0.026, top - 0.006),
+        (rear + 0.004, over[1] + 0.006),
+        (rear + 0.008, over[1]),
+        (rear + 0.004, over[1] - 0.004),
+        (rear - 0.013, bottom),
+    ]
     wing = 0.5 * side
     arm = [
         extrude(profile(crown), 1, -w, w, skin),
@@ -110,18 +130,17 @@ def _stapler(rng: np.random.Generator, name: str, middle: bool) -> Model:
         box((-nose + 0.012, -0.7 * w, top - 0.008), (-0.05 * nose, 0.7 * w, top + 0.0015), rubber, 0.002),
     ]
 
-    def hinge(parent: str, at: np.ndarray, degrees: float) -> Hinge:
-        limit = float(np.radians(degrees))
-        return Hinge(parent, "revolute", (0, 1, 0), (float(at[0]), 0.0, float(at[1])), (0.0, limit), opening(rng, limit))
+    def lifting(parent: str, at: np.ndarray, degrees: float) -> Hinge:
+        return turning(rng, parent, (0, 1, 0), (float(at[0]), 0, float(at[1])), degrees)
 
     if not middle:
         neck = box((rear - 0.02, -wing, z0), (rear + 0.004, wing, over[1]), steel, 0.002)
-        arm_body = Body("arm", glossy((*magazine, neck, *arm), 0.7), hinge("base", pin, 70))
+        arm_body = Body("arm", glossy((*magazine, neck, *arm), 0.7), lifting("base", pin, 70))
         return Model(name, (Body("base", glossy(base, 0.7)), arm_body))
     magazine += [cheek(k * (wing + gap + 0.0008), over, z0 + 0.002, 0.007, 0.0016) for k in (-1, 1)]
     movers = (
-        Body("magazine", glossy(magazine, 0.7), hinge("base", pin, 45)),
-        Body("arm", glossy(arm, 0.7), hinge("magazine", over, 55)),
+        Body("magazine", glossy(magazine, 0.7), lifting("base", pin, 45)),
+        Body("arm", glossy(arm, 0.7), lifting("magazine", over, 55)),
     )
     return Model(name, (Body("base", glossy(base, 0.7)), *movers))
 
@@ -138,39 +157,43 @@ def stapler3(rng: np.random.Generator) -> Model:
 
 def usb(rng: np.random.Generator) -> Model:
     """A memory stick whose steel cover swivels round it."""
-    stuff = Stuff(rng)
-    w, length, rear, t = rng.uniform(0.0085, 0.01), rng.uniform(0.034, 0.042), 0.0098, rng.uniform(0.007, 0.009)
+    stuff = Stuff(rng, 0.06)
+    w, length, t = rng.uniform(0.0085, 0.01), rng.uniform(0.034, 0.042), rng.uniform(0.007, 0.009)
     plug, gap, sheet = 0.014, 0.0005, 0.0011
     z0 = sheet + gap
     skin = stuff.front(int(rng.choice([2, 3])), 0)
     turn = np.linspace(np.pi / 2, 1.5 * np.pi, 21)
-    outline = np.array([*zip(w * np.cos(turn), w * np.sin(turn), strict=True), (length - plug, -w), (length - plug, w)])
+
+    def rounded(end: float, swell: float) -> np.ndarray:
+        """A strip from a round rear end about the pivot to x = ``end``."""
+        rear = np.stack([swell * w * np.cos(turn), w * np.sin(turn)], 1)
+        return np.vstack([rear, [(end, -w), (end, w)]])
+
     steel = brushed((0.78, 0.79, 0.8), 0, stuff.seed(), 0.1, 0.0008)
-    pw, pt = 0.0062, 0.0024
-    zm = z0 + t / 2
+    pw, pt, start, zm = 0.0062, 0.0024, length - plug - 0.0005, z0 + t / 2
+    contacts = stripes(plain((0.15, 0.15, 0.16), 3), plain((0.85, 0.68, 0.3), 4), 1, 0.0026, 0.6)
+    tongue = by_face(plain((0.9, 0.9, 0.88), 3), f5=contacts)
+    grey = plain((0.55, 0.55, 0.57), 2)
     base = [
-        extrude(outline, 2, z0, z0 + t, skin),
-        *open_box((length - plug - 0.0005, -pw, zm - pt), (length, pw, zm + pt), 0.0004, steel, plain((0.55, 0.55, 0.57), 2), face=1),
-        box((length - plug - 0.0005, -pw + 0.0008, zm - pt + 0.0003), (length - 0.0008, pw - 0.0008, zm + 0.0002), by_face(plain((0.9, 0.9, 0.88), 3), f5=stripes(plain((0.15, 0.15, 0.16), 3), plain((0.85, 0.68, 0.3), 4), 1, 0.0026, 0.6))),
+        extrude(rounded(length - plug, 1), 2, z0, z0 + t, skin),
+        *open_box((start, -pw, zm - pt), (length, pw, zm + pt), 0.0004, steel, grey, face=1),
+        box((start, 0.0008 - pw, zm - pt + 0.0003), (length - 0.0008, pw - 0.0008, zm + 0.0002), tongue),
     ]
     far, top = length + 0.002, z0 + t + gap
-    sheet_line = np.array([*zip(0.95 * w * np.cos(turn), w * np.sin(turn), strict=True), (far + sheet, -w), (far + sheet, w)])
-    print_ = stripes(steel, stuff.paint(1), 0, 1.0, 0.006, far - 0.016)
     cover = [
-        extrude(sheet_line, 2, 0, sheet, steel),
-        extrude(sheet_line, 2, top, top + sheet, print_),
+        extrude(rounded(far + sheet, 0.95), 2, 0, sheet, steel),
+        extrude(rounded(far + sheet, 0.95), 2, top, top + sheet, steel),
+        box((far - 0.014, -w, top), (far - 0.007, w, top + sheet + 0.0002), stuff.paint(1)),
         box((far, -w, 0.0002), (far + sheet, w, top + sheet - 0.0002), steel),
         cylinder((0, 0, top + sheet - 0.0002), (0, 0, 1), 0.0032, 0.0012, stuff.metal(0)),
     ]
-    limit = float(np.radians(175))
-    sense = 1 if rng.random() < 0.5 else -1
-    hinge = Hinge("base", "revolute", (0, 0, sense), (0, 0, 0), (0.0, limit), opening(rng, limit))
+    hinge = turning(rng, "base", (0, 0, 1 if rng.random() < 0.5 else -1), (0, 0, 0), 175)
     return Model("usb", (Body("base", glossy(base, 0.7)), Body("cover", glossy(cover), hinge)))
 
 
 def blade(rng: np.random.Generator) -> Model:
     """A cutter that lies flat: a hollow handle with a slot, in which a thumb piece slides the blade."""
-    stuff = Stuff(rng)
+    stuff = Stuff(rng, 0.2)
     half, w, t = rng.uniform(0.07, 0.085), rng.uniform(0.010, 0.0125), rng.uniform(0.013, 0.016)
     wall, gap, slot = 0.0018, 0.0008, 0.0034
     skin = stuff.paint(0) if rng.random() < 0.5 else stuff.front(2, 0)
@@ -180,15 +203,18 @@ def blade(rng: np.random.Generator) -> Model:
     steel = brushed((0.62, 0.63, 0.66), 0, stuff.seed(), 0.15, 0.002)
     case = [
         box((-half, -w, 0), (half, w, wall), by_face(skin, f5=dark)),
-        *(box((-half, min(k * w, k * (w - wall)), wall), (half, max(k * w, k * (w - wall)), t - wall), skin) for k in (-1, 1)),
         box((-half, wall - w, wall), (wall - half, w - wall, t - wall), skin),
         box((-half, -w, t - wall), (stop, w, t), skin),
-        *(box((stop, min(k * w, k * slot), t - wall), (half, max(k * w, k * slot), t), skin) for k in (-1, 1)),
         box((-half - 0.004, -0.8 * w, 0.001), (-half + 0.004, 0.8 * w, t - 0.001), rubber, 0.002),
         box((-half + 0.006, -0.8 * w, t - 0.0005), (stop - 0.004, 0.8 * w, t + 0.0012), rubber, 0.0008),
-        *(box((stop, k * (w + 0.0002) - 0.001, 0.002), (half - 0.02, k * (w + 0.0002) + 0.001, t - 0.002), rubber, 0.0008) for k in (-1, 1)),
-        *(box((half - 0.012, min(k * w, k * (w - 0.001)), -0.0), (half + 0.0, max(k * w, k * (w - 0.001)), t), steel) for k in (-1, 1)),
     ]
+    for k in (-1, 1):
+        case += [
+            box((-half, k * w, wall), (half, k * (w - wall), t - wall), skin),
+            box((stop, k * w, t - wall), (half, k * slot, t), skin),
+            box((stop, k * (w - 0.0008), 0.002), (half - 0.02, k * (w + 0.0012), t - 0.002), rubber, 0.0008),
+            box((half - 0.012, k * w, 0), (half, k * (w - 0.001), t), steel),
+        ]
     travel = (half - stop) * rng.uniform(0.55, 0.7)
     x0, tip, b, z = stop + 0.006, half - 0.003, w - wall - gap, 0.5 * t
     scored = stripes(steel, plain((0.35, 0.36, 0.38), 3), 0, 0.008, 0.12)
@@ -200,5 +226,5 @@ def blade(rng: np.random.Generator) -> Model:
         box((x0, gap - slot, z), (x0 + 0.017, slot - gap, t + 0.002), dark),
         box((x0 - 0.002, -0.62 * w, t + gap), (x0 + 0.019, 0.62 * w, t + 0.0045), thumb, 0.0012),
     ]
-    hinge = Hinge("base", "prismatic", (1, 0, 0), (x0, 0, z), (0.0, travel), opening(rng, travel))
+    hinge = sliding(rng, "base", (1, 0, 0), (x0, 0, z), travel)
     return Model("blade", (Body("base", glossy(case, 0.6)), Body("blade", tuple(slider), hinge)))

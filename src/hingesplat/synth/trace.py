@@ -22,8 +22,10 @@ LIGHT_STEP = 2  # Light is traced on every second texel each way; it is smoother
 AMBIENT = 0.14  # Of full light, everywhere: what bounces between surfaces.
 GAMMA = 2.2
 SUNS = 3
-SHININESS = 60.0  # Of Blinn's highlight; a clear coat reflects F0 of what meets it head-on.
-F0 = 0.05
+SKY = np.array([0.95, 1.0, 1.08], np.float32)
+SHININESS = 60.0  # Of Blinn's highlight; cosines below GLINT leave nothing of it.
+GLINT = 0.92
+F0 = 0.05  # A clear coat reflects so much of what meets it head-on.
 
 
 def _lights() -> tuple[np.ndarray, np.ndarray]:
@@ -81,7 +83,7 @@ class Surface:
         self.vertices, self.faces = np.concatenate(vertices), np.concatenate(faces)
         self.corner_texel = np.concatenate(coords)[self.faces].astype(np.float32)  # (triangles, 3, 2)
         self.patch_of, self.body_of_vertex = np.concatenate(patch_of), np.concatenate(body_of)
-        self.gloss, self.corner_normal = np.array(gloss), np.concatenate(normals)[self.faces].astype(np.float32)
+        self.normals, self.gloss = np.concatenate(normals), np.array(gloss, np.float32)
         self.albedo = np.clip(np.concatenate(albedo), 0.01, 1) ** GAMMA
 
 
@@ -99,6 +101,8 @@ class LitScene:
         per_body = np.stack([poses[b.name] for b in surface.model.bodies])[surface.body_of_vertex]
         self.vertices = (per_body[:, :3, :3] @ surface.vertices[:, :, None])[..., 0] + per_body[:, :3, 3]
         self.shift = 1e-3 * float(np.ptp(self.vertices, axis=0).max())  # Rays start so far off the surface.
+        normals = (per_body[:, :3, :3] @ surface.normals[:, :, None])[..., 0]
+        self.corner_normal = normals[surface.faces].astype(np.float32)
         self.device = EmbreeDevice()
         self.scene = EmbreeScene(self.device)
         TriangleMesh(self.scene, self.vertices.astype(np.float32), surface.faces.astype(np.int32))
@@ -157,11 +161,11 @@ class LitScene:
         rgba[found, :3] = self.colours[self.offsets[patch] + ij[:, 0] * self.shapes[patch, 1] + ij[:, 1]]
         rgba[found, 3] = 255
         if (coat := np.flatnonzero(self.surface.gloss[patch])).size:
-            bary = np.concatenate([1 - u - v, u, v], 1)[coat]
-            x = origin + d[found[coat]] * hit["tfar"][found[coat], None]
-            shine = self._shine(x, d[found[coat]], face[coat], bary) * self.surface.gloss[patch[coat], None]
-            under = (rgba[found[coat], :3] / 255) ** GAMMA
-            rgba[found[coat], :3] = 255 * np.clip(under + shine, 0, 1) ** (1 / GAMMA)
+            here, (u, v) = found[coat], (u[coat], v[coat])
+            x = origin.astype(np.float32) + d[here] * hit["tfar"][here, None]
+            shine = self._shine(x, d[here], face[coat], np.concatenate([1 - u - v, u, v], 1))
+            under = (rgba[here, :3] / 255) ** GAMMA + shine * self.surface.gloss[patch[coat], None]
+            rgba[here, :3] = 255 * np.clip(under, 0, 1) ** (1 / GAMMA)
         # One raw array for what only the pixel's centre tells: z-depth and body.
         centre = np.zeros((len(d), 2), np.float32)
         centre[found, 0] = hit["tfar"][found] * (d[found] @ camera.T_world_camera[:3, 2])
@@ -176,31 +180,27 @@ class LitScene:
         middle[y0 : y0 + h, x0 : x0 + w] = centre.reshape(h, SAMPLES, w, SAMPLES, 2)[:, m, :, m]
         return picture, middle[..., 0], middle[..., 1].astype(np.uint8)
 
-    def _shine(self, x: np.ndarray, directions: np.ndarray, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
-        """What a clear coat at the points (n, 3) adds, seen along ``directions``: highlights of the suns, and the sky.
+    def _shine(self, x: np.ndarray, towards: np.ndarray, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
+        """What a clear coat at the points (n, 3) adds, seen along the rays ``towards`` them: suns, and the sky.
 
-        Linear RGB (n, 3). Bodies of the object darken the sky, but are not mirrored.
+        Linear RGB (n, 3). Bodies of the object darken the sky, but are not mirrored. All float32.
         """
-        body = self.body_of_face[face]
-        turn = np.stack([self.poses[b.name][:3, :3] for b in self.surface.model.bodies])[body]
-        n = (turn @ (bary[:, :, None] * self.surface.corner_normal[face]).sum(1)[:, :, None])[..., 0]
-        n /= np.linalg.norm(n, axis=1, keepdims=True)
-        d = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-        facing = np.clip(-(n * d).sum(1), 0, 1)
-        mirrored = d + 2 * facing[:, None] * n
-        fresnel = F0 + (1 - F0) * (1 - facing) ** 5
-        start = (x + 2 * self.shift * n).astype(np.float32)
-        free = self.scene.run(start, mirrored.astype(np.float32), query="OCCLUDED") < 0
-        sky = np.clip(0.35 + 0.65 * mirrored[:, 2], 0.1, 1) * fresnel * free
-        out = sky[:, None] * np.array([0.95, 1.0, 1.08])
-        for towards, colour in zip(*(a[:SUNS] for a in _lights()), strict=True):
-            half = towards - d
-            half /= np.linalg.norm(half, axis=1, keepdims=True)
-            glint = np.clip((n * half).sum(1), 0, 1) ** SHININESS * ((n @ towards) > 0)
-            lit = np.flatnonzero(glint > 0.01)
-            rays = np.broadcast_to(towards.astype(np.float32), (len(lit), 3)).copy()
+        n = np.einsum("nk,nki->ni", bary, self.corner_normal[face])
+        n /= np.sqrt(np.einsum("ni,ni->n", n, n))[:, None]
+        facing = np.clip(-np.einsum("ni,ni->n", n, towards), 0, 1)
+        mirrored = towards + 2 * facing[:, None] * n
+        start = x + 2 * self.shift * n
+        out = np.zeros_like(x)
+        sky = np.clip(0.35 + 0.65 * mirrored[:, 2], 0.1, 1) * (F0 + (1 - F0) * (1 - facing) ** 5)
+        free = self.scene.run(start, mirrored, query="OCCLUDED") < 0
+        out[free] = sky[free, None] * SKY
+        for sun, colour in zip(*(a[:SUNS].astype(np.float32) for a in _lights()), strict=True):
+            half = sun - towards
+            cosine = np.einsum("ni,ni->n", n, half) / np.sqrt(np.einsum("ni,ni->n", half, half))
+            lit = np.flatnonzero((cosine > GLINT) & (n @ sun > 0))
+            rays = np.broadcast_to(sun, (len(lit), 3)).copy()
             lit = lit[self.scene.run(start[lit], rays, query="OCCLUDED") < 0]
-            out[lit] += 0.6 * glint[lit, None] * colour
+            out[lit] += 0.6 * cosine[lit, None] ** SHININESS * colour
         return out
 
     def _window(self, camera: Camera) -> tuple[int, int, int, int]:
