@@ -172,7 +172,7 @@ class Export:
     """Folder to write to; RUN/export if none is given."""
     options: Annotated[ExportConfig, tyro.conf.arg(name="")] = field(default_factory=ExportConfig)
     check: bool = True
-    """Load what was written in the simulators that are installed, and drive each joint end to end."""
+    """Whether what was written is loaded in the simulators installed, and each joint driven end to end."""
     quiet: bool = False
     """Say nothing but warnings and errors."""
 
@@ -182,9 +182,7 @@ class Export:
 
         twin, meshes, gaussians = load_result(self.run_folder)
         home = self.run_folder / "export"
-        paths = export_twin(
-            twin, meshes, gaussians, self.out or home, self.format, self.options, cache=home / ".hulls"
-        )
+        paths = export_twin(twin, meshes, gaussians, self.out or home, self.format, self.options, cache=home / ".hulls")
         for form, path in paths.items():
             console.print(f"written: {escape(str(path))}", soft_wrap=True)
             for check in check_export(form, path) if self.check else ():
@@ -372,6 +370,8 @@ def show_metrics(console: Console, metrics: dict[str, Any]) -> None:
         "SSIM": _number(views["ssim"], 4),
         "part IoU": _number(metrics["part_iou"], 3),
     }
+    if (simulated := metrics.get("simulation")) is not None:
+        numbers["MuJoCo"] = "moves" if simulated["ok"] else "fails"
     rest = Table(*numbers, box=SIMPLE_HEAD)
     rest.add_row(*numbers.values())
     console.print(rest)

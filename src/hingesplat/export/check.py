@@ -4,6 +4,8 @@ Each simulator runs in a process of its own, ``python -m hingesplat.export.check
 heard, and one that crashes takes nothing with it.
 """
 
+# pyright: reportAttributeAccessIssue=false
+
 import json
 import os
 import subprocess
@@ -148,7 +150,7 @@ def sweep(
             if t % (SECONDS / 2) > 0.95 * SECONDS / 2:
                 errors = [abs(now[n] - wanted[n]) / (limits[n][1] - limits[n][0]) for n in limits]
                 worst = max(worst, *errors)
-    return 100 * worst
+    return 100 * float(worst)
 
 
 def _mujoco(path: Path) -> Check:

@@ -12,7 +12,7 @@ from trimesh.exchange.obj import export_obj
 from hingesplat.errors import HingesplatError
 from hingesplat.export import ExportConfig
 from hingesplat.export.obj import write_obj
-from hingesplat.export.solids import closed_mesh, collision_hulls, colours, free_range, near
+from hingesplat.export.solids import closed_mesh, collision_hulls, free_range, near
 from hingesplat.files import write_text
 from hingesplat.twin import Joint, Part, Twin
 
@@ -44,8 +44,6 @@ class Link:
     """(3,) in the link frame."""
     inertia: np.ndarray
     """(3, 3) about the centre of mass, link axes."""
-    colour: tuple[float, float, float]
-    """Mean rgb in [0, 1]."""
 
     @property
     def offset(self) -> np.ndarray:
@@ -199,7 +197,7 @@ def _link(
         joint = replace(joint, axis=(x, y, z), pivot=tuple(origin), limits=(unit * low, unit * high))
     if solid is None:
         token = np.eye(3) * 1e-6
-        return Link(name, part, joint, parent, origin, None, (), 1e-3, np.zeros(3), token, (0.5, 0.5, 0.5))
+        return Link(name, part, joint, parent, origin, None, (), 1e-3, np.zeros(3), token)
     T_link_twin = np.eye(4)
     T_link_twin[:3, :3], T_link_twin[:3, 3] = factor * R, -origin
     # Hulls are cut in the twin's own frame, so that no option cuts the mesh anew.
@@ -207,9 +205,8 @@ def _link(
     mesh = solid.copy().apply_transform(T_link_twin)
     mesh.density = config.density
     inertia = np.asarray(mesh.moment_inertia)
-    r, g, b = (float(v) for v in colours(mesh).mean(0) / 255)
     com, mass = np.asarray(mesh.center_mass), float(mesh.mass)
-    return Link(name, part, joint, parent, origin, mesh, hulls, mass, com, (inertia + inertia.T) / 2, (r, g, b))
+    return Link(name, part, joint, parent, origin, mesh, hulls, mass, com, (inertia + inertia.T) / 2)
 
 
 def _extended(joint: Joint, twin: Twin, solids: dict[int, trimesh.Trimesh]) -> Joint:

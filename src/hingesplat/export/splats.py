@@ -89,9 +89,7 @@ def _convert(source: Path, target: Path) -> None:
     source.unlink()
     if "error" in made:
         raise HingesplatError(f"{target}: cannot be made: {made['error']}; export PLY instead")
-    tmp = target.with_name(target.name + ".tmp")
-    tmp.write_bytes(made["data"])
-    tmp.replace(target)
+    target.write_bytes(made["data"])
 
 
 def write_ply(gaussians: Gaussians, path: Path) -> None:

@@ -42,10 +42,8 @@ def _add_link(robot: etree._Element, link: Link) -> None:
     etree.SubElement(inertial, "inertia", **{k: numbers(v) for k, v in moments.items()})
     if link.mesh is None:
         return
-    visual = etree.SubElement(element, "visual", name=f"{link.name}_visual")
-    _add_mesh(visual, f"meshes/{link.name}.obj")
-    material = etree.SubElement(visual, "material", name=f"{link.name}_colour")
-    etree.SubElement(material, "color", rgba=numbers([*link.colour, 1]))
+    # Without a material of its own, so that the mesh's texture shows: PyBullet would multiply the two.
+    _add_mesh(etree.SubElement(element, "visual", name=f"{link.name}_visual"), f"meshes/{link.name}.obj")
     for i in range(len(link.hulls)):
         collision = etree.SubElement(element, "collision", name=f"{link.name}_collision_{i}")
         _add_mesh(collision, f"collision/{link.name}_{i}.obj")

@@ -3,6 +3,8 @@
 The one file that may import pxr.
 """
 
+# pyright: reportAttributeAccessIssue=false
+
 from pathlib import Path
 from typing import Any
 
@@ -59,14 +61,15 @@ def write_usd(links: list[Link], gaussians: Gaussians, out: Path, *, up_axis: st
         _add_joint(stage, link, links)
     for a, b in touching(links):
         UsdPhysics.FilteredPairsAPI.Apply(stage.GetPrimAtPath(_path(a))).CreateFilteredPairsRel().AddTarget(_path(b))
-    stage.Export(str(path.with_suffix(".tmp.usd")))
-    return path.with_suffix(".tmp.usd").replace(path)
+    stage.Export(str(path))
+    return path
 
 
 def validate(path: Path) -> tuple[int, list[str]]:
     """The number of joints that move in a USD file, and what UsdValidation finds wrong with it."""
     stage = Usd.Stage.Open(str(path))
-    errors = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators()).Validate(stage)
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    errors = UsdValidation.ValidationContext(validators).Validate(stage)
     kinds = (UsdPhysics.RevoluteJoint, UsdPhysics.PrismaticJoint)
     joints = sum(any(prim.IsA(kind) for kind in kinds) for prim in stage.Traverse())
     return joints, [f"{e.GetName()}: {' '.join(e.GetMessage().split())}" for e in errors]
