@@ -408,12 +408,11 @@ def load_result(folder: Path) -> tuple[Twin, dict[int, trimesh.Trimesh], Gaussia
     Raises:
         HingesplatError: the folder holds no twin, a run that has not come so far, or something broken.
     """
-    unfinished = HingesplatError(f"{folder}: its run is not finished; give the same `hingesplat reconstruct` again")
-    if (folder / "stages.json").is_file() and not (folder / "twin.json").is_file():
-        raise unfinished
-    twin = Twin.load(folder / "twin.json")
-    if all(part.mesh is None for part in twin.parts):
-        raise unfinished
+    path = folder / "twin.json"
+    early = (folder / "stages.json").is_file() and not path.is_file()
+    twin = None if early else Twin.load(path)
+    if twin is None or all(part.mesh is None for part in twin.parts):
+        raise HingesplatError(f"{folder}: its run is not finished; give the same `hingesplat reconstruct` again")
     return twin, load_meshes(folder, twin), Gaussians.load(folder / "gaussians.safetensors")
 
 

@@ -134,8 +134,10 @@ def sweep(
         step: takes targets, goes on by one timestep, and returns where the joints are.
 
     Returns:
-        The worst error when a joint ought to rest at an end, the held ones included, in percent of its range;
-        infinite when a number is none.
+        The worst error when a joint ought to rest at an end, the held ones included, in percent of its range.
+
+    Raises:
+        FloatingPointError: a position is infinite or no number.
     """
     worst, steps = 0.0, round(SECONDS / timestep)
     rest = {name: float(np.clip(0.0, *limit)) for name, limit in limits.items()}
@@ -146,7 +148,7 @@ def sweep(
             wanted = rest | {name: target(t, low, high)}
             now = step(wanted)
             if not all(np.isfinite(v) for v in now.values()):
-                return float("inf")
+                raise FloatingPointError(f"the simulation exploded after {t:.2f} s of driving joint {name}")
             if t % (SECONDS / 2) > 0.95 * SECONDS / 2:
                 errors = [abs(now[n] - wanted[n]) / (limits[n][1] - limits[n][0]) for n in limits]
                 worst = max(worst, *errors)

@@ -60,9 +60,9 @@ class Link:
         low, high = self.joint.limits if self.joint else (0.0, 0.0)
         return low, max(high, low + 1e-4)
 
-    def above(self, other: "Link") -> bool:
+    def carries(self, other: "Link") -> bool:
         """Whether ``other`` is this link or hangs from it."""
-        return other is self or (other.parent is not None and self.above(other.parent))
+        return other is self or (other.parent is not None and self.carries(other.parent))
 
 
 def build_links(twin: Twin, meshes: dict[int, trimesh.Trimesh], config: ExportConfig, cache: Path) -> list[Link]:
@@ -138,7 +138,7 @@ def axis_load(link: Link, links: list[Link]) -> tuple[float, float]:
     slides = link.joint.type == "prismatic"
     inertia = weight = 0.0
     for other in links:
-        if link.above(other):
+        if link.carries(other):
             arm = np.cross(axis, other.origin + other.com - link.origin)
             inertia += other.mass if slides else float(other.mass * arm @ arm + axis @ other.inertia @ axis)
             weight += GRAVITY * other.mass * (1.0 if slides else float(np.linalg.norm(arm)))

@@ -13,7 +13,7 @@ import torch
 import trimesh
 
 from hingesplat.errors import HingesplatError
-from hingesplat.export.links import Link, joint_dynamics, servo_gain, touching
+from hingesplat.export.links import Link, axis_load, joint_dynamics, servo_gain, touching
 from hingesplat.export.solids import colours
 from hingesplat.gaussians import Gaussians
 
@@ -156,14 +156,13 @@ def _add_joint(stage: Usd.Stage, link: Link, links: list[Link]) -> None:
     joint.CreateAxisAttr(UsdPhysics.Tokens.x)
     joint.CreateLowerLimitAttr(link.limits[0] * unit)
     joint.CreateUpperLimitAttr(link.limits[1] * unit)
-    dynamics, gain = joint_dynamics(link, links), servo_gain(link, links)
+    gain, (inertia, _) = servo_gain(link, links), axis_load(link, links)
     drive = UsdPhysics.DriveAPI.Apply(joint.GetPrim(), "linear" if slides else "angular")
     drive.CreateTypeAttr(UsdPhysics.Tokens.force)
     drive.CreateTargetPositionAttr(0.0)
-    drive.CreateMaxForceAttr(dynamics["effort"])
+    drive.CreateMaxForceAttr(joint_dynamics(link, links)["effort"])
     drive.CreateStiffnessAttr(gain / unit)
-    # Critical: twice the root of stiffness times inertia, which is damping / 2.
-    drive.CreateDampingAttr(2 * (gain * dynamics["damping"] / 2) ** 0.5 / unit)
+    drive.CreateDampingAttr(2 * (gain * inertia) ** 0.5 / unit)  # Critical.
 
 
 def _x_to(axis: np.ndarray) -> np.ndarray:
