@@ -370,11 +370,13 @@ def show_metrics(console: Console, metrics: dict[str, Any]) -> None:
         "SSIM": _number(views["ssim"], 4),
         "part IoU": _number(metrics["part_iou"], 3),
     }
-    if (simulated := metrics.get("simulation")) is not None:
-        numbers["MuJoCo"] = "moves" if simulated["ok"] else "fails"
     rest = Table(*numbers, box=SIMPLE_HEAD)
     rest.add_row(*numbers.values())
     console.print(rest)
+    if (row := metrics.get("simulation")) is not None:
+        worst = max(row[form]["error_percent"] or 0.0 for form in ("mjcf", "urdf"))
+        how = f"worst tracking error {worst:.2g} % of range" if row["ok"] else "fails; metrics.json says how"
+        console.print(f"exports in {row['program']}: {how}")
     if views.get("why_null"):
         console.print(f"no pictures compared: {escape(views['why_null'])}", soft_wrap=True)
 
