@@ -257,7 +257,7 @@ def test_identical_states_give_a_static_twin(cabinet: Path, tmp_path: Path) -> N
     assert [part.name for part in twin.parts] == ["base"] and twin.joints == ()
     assert "no motion found between state 0 and state 1" in (tmp_path / "run" / "log.txt").read_text()
     for name in (
-        *("parts/base.ply", "parts/base.glb", "parts/base.obj", "export/twin.urdf", "export/twin.xml"),
+        *("parts/base.ply", "parts/base.glb", "parts/base.obj", "export/urdf/twin.urdf", "export/mjcf/twin.xml"),
         *("gaussians_state0.safetensors", "gaussians_state1.safetensors", "motion.gif", "summary.png"),
     ):
         assert (tmp_path / "run" / name).stat().st_size > 0, name

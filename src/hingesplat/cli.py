@@ -8,11 +8,10 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, make_dataclass, replace
-from dataclasses import field as dataclass_field
+from dataclasses import dataclass, field, make_dataclass, replace
 from math import degrees
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.box import SIMPLE_HEAD
@@ -24,8 +23,10 @@ from rich.text import Text
 
 import hingesplat
 from hingesplat.errors import HingesplatError
+from hingesplat.export import FORMATS, ExportConfig, export_twin
 
 if TYPE_CHECKING:
+    from hingesplat.export.check import Check
     from hingesplat.pipeline import ReconstructConfig
     from hingesplat.twin import Twin
 
@@ -80,6 +81,7 @@ class Demo:
 
     def run(self, console: Console) -> None:
         from hingesplat.capture import load_capture
+        from hingesplat.export.check import simulation
         from hingesplat.metrics import evaluate
 
         started = time.perf_counter()
@@ -88,7 +90,7 @@ class Demo:
             Synth("cabinet", capture, size=200, views=60, test_views=10, below=0.125).run(console)
         twin = _reconstruct(load_capture(capture), demo_config(), run, True, console)
         show_joints(console, twin)
-        show_metrics(console, evaluate(run, capture / "truth"))
+        show_metrics(console, evaluate(run, capture / "truth", simulation(run / "export")))
         show_paths(console, run)
         console.print(f"{time.perf_counter() - started:.0f} s in all")
 
@@ -118,9 +120,10 @@ class Evaluate:
     """Say nothing but warnings and errors."""
 
     def run(self, console: Console) -> None:
+        from hingesplat.export.check import simulation
         from hingesplat.metrics import evaluate
 
-        show_metrics(console, evaluate(self.run_folder, self.truth))
+        show_metrics(console, evaluate(self.run_folder, self.truth, simulation(self.run_folder / "export")))
         console.print(f"written: {escape(str(self.run_folder / 'metrics.json'))}", soft_wrap=True)
 
 
@@ -168,39 +171,31 @@ class Synth:
 
 @dataclass(frozen=True)
 class Export:
-    """Write a run's twin for simulators and viewers."""
+    """Write a run's twin for simulators and splat viewers, each format into a folder that can be moved."""
 
     run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """A run folder."""
-    format: tuple[Literal["urdf", "mjcf", "ply"], ...] = ("urdf", "mjcf")
-    """ply: the whole twin in state 0 as one file of splats."""
+    format: Annotated[tuple[str, ...], tyro.conf.arg(metavar=f"{{{','.join(FORMATS)}}} ...")] = ("urdf", "mjcf")
+    """One or more; OUT/FORMAT is what is written."""
     out: Path | None = None
     """Folder to write to; RUN/export if none is given."""
+    options: Annotated[ExportConfig, tyro.conf.arg(name="")] = field(default_factory=ExportConfig)
+    check: bool = True
+    """Whether what was written is loaded in the simulators installed, and each joint driven end to end."""
     quiet: bool = False
     """Say nothing but warnings and errors."""
 
     def run(self, console: Console) -> None:
-        from hingesplat.export.mjcf import write_mjcf
-        from hingesplat.export.splats import write_ply
-        from hingesplat.export.urdf import write_urdf
-        from hingesplat.gaussians import Gaussians
-        from hingesplat.pipeline import load_meshes
-        from hingesplat.twin import Twin
+        from hingesplat.export.check import check_export
+        from hingesplat.pipeline import load_result
 
-        twin = Twin.load(self.run_folder / "twin.json")
-        meshes = load_meshes(self.run_folder, twin)
-        out = self.out or self.run_folder / "export"
-        out.mkdir(parents=True, exist_ok=True)
-        for name in dict.fromkeys(self.format):
-            match name:
-                case "urdf":
-                    path = write_urdf(twin, meshes, out, scale=twin.metres_per_unit)
-                case "mjcf":
-                    path = write_mjcf(twin, meshes, out, scale=twin.metres_per_unit)
-                case "ply":
-                    path = out / "twin.ply"
-                    write_ply(Gaussians.load(self.run_folder / "gaussians.safetensors"), path)
+        twin, meshes, gaussians = load_result(self.run_folder)
+        home = self.run_folder / "export"
+        paths = export_twin(twin, meshes, gaussians, self.out or home, self.format, self.options, cache=home / ".hulls")
+        for form, path in paths.items():
             console.print(f"written: {escape(str(path))}", soft_wrap=True)
+            for check in check_export(form, path) if self.check else ():
+                show_check(console, form, check)
 
 
 Command = Reconstruct | Demo | Evaluate | Synth | Export
@@ -243,7 +238,7 @@ def parse_reconstruct(args: list[str]) -> Reconstruct:
 
     def parsed(default: ReconstructConfig) -> Any:
         nested: Any = Annotated[ReconstructConfig, tyro.conf.arg(name="")]
-        fields = [("config", nested, dataclass_field(default=default, kw_only=True))]
+        fields = [("config", nested, field(default=default, kw_only=True))]
         full = make_dataclass("Reconstruct", fields, bases=(Reconstruct,), frozen=True)
         prog = "hingesplat reconstruct"
         return tyro.cli(full, args=args, prog=prog, description=Reconstruct.__doc__, config=FLAGS)
@@ -387,8 +382,26 @@ def show_metrics(console: Console, metrics: dict[str, Any]) -> None:
     rest = Table(*numbers, box=SIMPLE_HEAD)
     rest.add_row(*numbers.values())
     console.print(rest)
+    if (row := metrics.get("simulation")) is not None:
+        worst = max(row[form]["error_percent"] or 0.0 for form in ("mjcf", "urdf"))
+        how = f"worst tracking error {worst:.2g} % of range" if row["ok"] else "fails; metrics.json says how"
+        console.print(f"exports in {row['program']}: {how}")
     if views.get("why_null"):
         console.print(f"no pictures compared: {escape(views['why_null'])}", soft_wrap=True)
+
+
+def show_check(console: Console, form: str, check: "Check") -> None:
+    """What a simulator made of an export; to stderr, too, what went wrong."""
+    parts = [f"{check.joints} joint{'' if check.joints == 1 else 's'}"]
+    if check.error_percent is not None:
+        parts.append(f"worst tracking error {check.error_percent:.2g} % of range")
+        parts.append(f"contacts: {'; '.join(check.contacts) or 'none'}")
+    parts.append(f"warnings: {len(check.warnings) or 'none'}")
+    console.print(f"  {form} in {check.program}: {', '.join(parts)}", soft_wrap=True)
+    for warning in check.warnings:
+        _say(f"{form} in {check.program}: {warning}")
+    if not check.ok and not check.warnings:
+        _say(f"{form} in {check.program}: a joint misses its end by {check.error_percent:.2g} % of its range")
 
 
 def show_paths(console: Console, run: Path) -> None:
@@ -397,8 +410,8 @@ def show_paths(console: Console, run: Path) -> None:
     for name, what in {
         "twin.json": "parts and joints",
         "parts": "splats and meshes",
-        "export/twin.urdf": "for robotics",
-        "export/twin.xml": "for MuJoCo",
+        "export/urdf/twin.urdf": "for robotics",
+        "export/mjcf/twin.xml": "for MuJoCo",
         "motion.gif": "the joints moving",
         "summary.png": "photographs, renders, parts",
         "metrics.json": "beside the truth",

@@ -30,9 +30,9 @@ from hingesplat.articulate import ArticulateConfig, Articulation, articulate
 from hingesplat.capture import Capture, View
 from hingesplat.capture.images import downsampled
 from hingesplat.errors import HingesplatError
-from hingesplat.export.mjcf import write_mjcf
+from hingesplat.export import export_twin
 from hingesplat.export.splats import write_ply
-from hingesplat.export.urdf import write_urdf
+from hingesplat.files import whole_folder
 from hingesplat.fit import FitConfig, fit
 from hingesplat.fuse import FuseConfig, fuse
 from hingesplat.gaussians import Gaussians, posed
@@ -309,11 +309,8 @@ def _mesh(run: Run) -> None:
 
 
 def _export(run: Run) -> None:
-    twin = Twin.load(run / "twin.json")
-    meshes = load_meshes(run.folder, twin)
-    with whole_folder(run / "export") as folder:
-        write_urdf(twin, meshes, folder, scale=twin.metres_per_unit)
-        write_mjcf(twin, meshes, folder, scale=twin.metres_per_unit)
+    twin, meshes, gaussians = load_result(run.folder)
+    export_twin(twin, meshes, gaussians, run / "export")
 
 
 def _pictures(run: Run) -> None:
@@ -403,6 +400,20 @@ def telling_view(gaussians: Gaussians, views: Sequence[View], size: int = 64) ->
         return float(render(gaussians, view.camera.scaled(w, h), channels=movable).channels.mean())
 
     return max(views, key=covered)
+
+
+def load_result(folder: Path) -> tuple[Twin, dict[int, trimesh.Trimesh], Gaussians]:
+    """The twin of a finished run, its part meshes by part id, and its Gaussians, all in state 0.
+
+    Raises:
+        HingesplatError: the folder holds no twin, a run that has not come so far, or something broken.
+    """
+    path = folder / "twin.json"
+    early = (folder / "stages.json").is_file() and not path.is_file()
+    twin = None if early else Twin.load(path)
+    if twin is None or all(part.mesh is None for part in twin.parts):
+        raise HingesplatError(f"{folder}: its run is not finished; give the same `hingesplat reconstruct` again")
+    return twin, load_meshes(folder, twin), Gaussians.load(folder / "gaussians.safetensors")
 
 
 def load_meshes(folder: Path, twin: Twin) -> dict[int, trimesh.Trimesh]:
@@ -550,17 +561,6 @@ def write_tensors(path: Path, tensors: dict[str, Tensor]) -> None:
     """Write a safetensors file, whole or not at all."""
     tmp = path.with_name(path.name + ".tmp")
     save_file({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, str(tmp))
-    tmp.replace(path)
-
-
-@contextmanager
-def whole_folder(path: Path) -> Iterator[Path]:
-    """A folder to write into that takes the place of ``path`` when all went well."""
-    tmp = path.with_name(path.name + ".tmp")
-    shutil.rmtree(tmp, ignore_errors=True)
-    tmp.mkdir(parents=True)
-    yield tmp
-    shutil.rmtree(path, ignore_errors=True)
     tmp.replace(path)
 
 

@@ -1,5 +1,6 @@
-"""The standard 3D Gaussian splatting PLY, as viewers and engines read it."""
+"""Splat files: the standard 3D Gaussian splatting PLY, SPZ and SOG, a file a part and one of the whole."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,13 @@ import torch
 
 from hingesplat.errors import HingesplatError
 from hingesplat.gaussians import Gaussians
+from hingesplat.render import sh_basis
+from hingesplat.se3 import matrix_to_wxyz, quat_multiply
+
+RUB = np.diag([1.0, -1.0, -1.0])
+"""Turns the axes of splat PLYs (x right, y down, z forward) to those of SPZ (x right, y up, z back)."""
+SPZ_EXTENT = 32.0
+"""Smaller objects are enlarged to at least this for SPZ, which keeps 1/4096: then 1/130 000 of the object."""
 
 
 def _names(rest: int) -> list[str]:
@@ -16,6 +24,72 @@ def _names(rest: int) -> list[str]:
         + [f"f_rest_{i}" for i in range(rest)]
         + ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     )
+
+
+def transformed(gaussians: Gaussians, R: np.ndarray, factor: float = 1.0) -> Gaussians:
+    """Gaussians turned and scaled about the origin, ``factor · R x``, their harmonics with them."""
+    g = gaussians.detached()
+    turn = torch.as_tensor(R, dtype=torch.float64)
+    directions = torch.nn.functional.normalize(torch.randn(64, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    d, count = directions.double(), g.sh.shape[1]
+    # The turned harmonics say in direction d what the old ones said in Rᵀ d.
+    mix = torch.linalg.lstsq(sh_basis(d, count), sh_basis(d @ turn, count)).solution
+    return replace(
+        g,
+        means=(factor * g.means.double() @ turn.T).to(g.means.dtype),
+        quats=quat_multiply(matrix_to_wxyz(turn).to(g.quats.dtype).expand_as(g.quats), g.quats),
+        log_scales=g.log_scales + float(np.log(factor)),
+        sh=torch.einsum("ab,nbc->nac", mix.to(g.sh.dtype), g.sh),
+    )
+
+
+def write_splats(gaussians: Gaussians, names: dict[int, str], out: Path, form: str) -> np.ndarray:
+    """Write ``out/twin.FORM`` and ``out/NAME.FORM``, a file a part, in state 0.
+
+    PLY and SOG keep the coordinates given. SPZ rounds to 1/4096, so its Gaussians are centred and small
+    objects enlarged, all files alike, and its axes are those that SPZ viewers expect.
+
+    Args:
+        gaussians: in the export's frame.
+        names: of the parts, by part id; parts without Gaussians get no file.
+        out: an existing folder.
+        form: ply, spz or sog.
+
+    Returns:
+        T_mesh_file (4, 4): takes coordinates in the files to those given.
+
+    Raises:
+        HingesplatError: gaussforge, which writes SPZ and SOG, is absent or fails.
+    """
+    T_mesh_file = np.eye(4)
+    g = gaussians.detached()
+    if form == "spz" and len(g):
+        low, high = g.means.double().amin(0), g.means.double().amax(0)
+        centre, extent = ((low + high) / 2).numpy(), float((high - low).norm())
+        factor = 2.0 ** max(0, np.ceil(np.log2(SPZ_EXTENT / max(extent, 1e-12))))
+        g = transformed(replace(g, means=(g.means.double() - torch.from_numpy(centre)).to(g.means.dtype)), RUB, factor)
+        T_mesh_file[:3, :3], T_mesh_file[:3, 3] = RUB.T / factor, centre
+    files = {"twin": g} | {name: g[g.part == i] for i, name in names.items()}
+    for name, part in files.items():
+        if len(part):
+            write_ply(part, out / f"{name}.ply")
+            if form != "ply":
+                _convert(out / f"{name}.ply", out / f"{name}.{form}")
+    return T_mesh_file
+
+
+def _convert(source: Path, target: Path) -> None:
+    """A PLY to what the target's suffix says; the PLY goes."""
+    try:
+        from gaussforge import GaussForge
+    except ImportError as e:
+        form = target.suffix[1:]
+        raise HingesplatError(f"{form}: needs the package gaussforge; pip install 'hingesplat[splats]'") from e
+    made = GaussForge().convert(source.read_bytes(), "ply", target.suffix[1:])
+    source.unlink()
+    if "error" in made:
+        raise HingesplatError(f"{target}: cannot be made: {made['error']}; export PLY instead")
+    target.write_bytes(made["data"])
 
 
 def write_ply(gaussians: Gaussians, path: Path) -> None:

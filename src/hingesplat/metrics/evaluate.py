@@ -1,7 +1,7 @@
 """A run beside the truth: every number of the field, in ``RUN/metrics.json``."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ MATCH_SAMPLES = 4000
 MATCH_RADIUS = 0.02
 """Of the object's extent: points nearer than this are the same surface."""
 STEPS = 11
+NO_SIMULATION = {"simulation": None, "simulation_why_null": "not asked for"}
 NO_LPIPS = "the weights of its network do not come with this package"
 
 
@@ -33,12 +34,13 @@ class FoundPart:
     """Cleaned, world frame, one a state."""
 
 
-def evaluate(run: Path, truth: Path) -> dict[str, Any]:
+def evaluate(run: Path, truth: Path, simulation: Mapping[str, Any] = NO_SIMULATION) -> dict[str, Any]:
     """Compare the twin in the folder ``run`` with the truth and write ``run/metrics.json``.
 
     Parts are counted with the base. Chamfer distances are squared, the sum of both directions, ×1000, of
     10 000 points a surface: means over both states and three draws of points. Where the photographs or the
-    Gaussians are not there, ``views`` holds nulls and ``why_null``.
+    Gaussians are not there, ``views`` holds nulls and ``why_null``. ``simulation`` is what
+    ``hingesplat.export.check.simulation`` gives and goes to the file as it is.
 
     Returns:
         What it wrote.
@@ -66,6 +68,7 @@ def evaluate(run: Path, truth: Path) -> dict[str, Any]:
         "penetration": _penetrations(twin, found),
         "views": views,
         **part_iou,
+        **simulation,
         "mesh_cleaning": "components below 10 % of the largest one's area dropped",
         "truth": str(truth),
     }
