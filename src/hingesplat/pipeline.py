@@ -27,7 +27,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from hingesplat.articulate import ArticulateConfig, Articulation, articulate
-from hingesplat.capture import Capture, View
+from hingesplat.camera import common_up
+from hingesplat.capture import Capture, View, load_cameras
 from hingesplat.capture.images import downsampled
 from hingesplat.errors import HingesplatError
 from hingesplat.export.mjcf import write_mjcf
@@ -38,8 +39,7 @@ from hingesplat.fuse import FuseConfig, fuse
 from hingesplat.gaussians import Gaussians, posed
 from hingesplat.joints import JointsConfig, find_joints
 from hingesplat.mesh import MeshConfig, mesh_parts
-from hingesplat.pictures import write_motion_gif, write_summary
-from hingesplat.render import render
+from hingesplat.pictures import movable_share, write_motion_gif, write_summary
 from hingesplat.search import Motion
 from hingesplat.segment import Segmentation, SegmentConfig, segment, track
 from hingesplat.twin import Joint, Part, Twin
@@ -292,7 +292,7 @@ def _joints(run: Run) -> None:
 
 
 def _mesh(run: Run) -> None:
-    gaussians, twin = _result(run)
+    gaussians, twin = load_result(run.folder)
     states = [([v.camera for v in views], twin.at_state(t)) for t, views in enumerate(run.views)]
     meshes = mesh_parts(gaussians, states, run.config.mesh)
     parts = []
@@ -317,7 +317,7 @@ def _export(run: Run) -> None:
 
 
 def _pictures(run: Run) -> None:
-    gaussians, twin = _result(run)
+    gaussians, twin = load_result(run.folder)
     poses = [twin.at_state(t) for t in range(len(run.capture.states))]
     best = [telling_view(posed(gaussians, T), views) for T, views in zip(poses, run.views, strict=True)]
     write_summary(run / "summary.png", gaussians, list(zip(best, poses, strict=True)))
@@ -341,10 +341,6 @@ STAGES: dict[str, Callable[[Run], None]] = {
 
 def _fitted(run: Run, state: int) -> Gaussians:
     return Gaussians.load(run / f"fit_state{state}.safetensors")
-
-
-def _result(run: Run) -> tuple[Gaussians, Twin]:
-    return Gaussians.load(run / "gaussians.safetensors"), Twin.load(run / "twin.json")
 
 
 def _check(config: ReconstructConfig) -> None:
@@ -392,17 +388,35 @@ def coloured(gaussians: Gaussians, offset: Tensor) -> Gaussians:
     return replace(gaussians, sh=sh).detached()
 
 
-@torch.no_grad()
-def telling_view(gaussians: Gaussians, views: Sequence[View], size: int = 64) -> View:
+def telling_view(gaussians: Gaussians, views: Sequence[View]) -> View:
     """The photograph in which the movable parts cover most pixels; the first one if nothing moves."""
+    return max(views, key=lambda view: movable_share(gaussians, view.camera))
 
-    def covered(view: View) -> float:
-        shrink = size / max(view.camera.width, view.camera.height)
-        w, h = (max(1, round(side * shrink)) for side in (view.camera.width, view.camera.height))
-        movable = (gaussians.part > 0).to(gaussians.means)[:, None]
-        return float(render(gaussians, view.camera.scaled(w, h), channels=movable).channels.mean())
 
-    return max(views, key=covered)
+def load_result(folder: Path) -> tuple[Gaussians, Twin]:
+    """The Gaussians, frame of state 0, and the twin of a run.
+
+    Raises:
+        HingesplatError: no such run, or one that has not come this far.
+    """
+    if not folder.is_dir():
+        raise HingesplatError(f"{folder}: no such run folder")
+    twin = Twin.load(folder / "twin.json")
+    return Gaussians.load(folder / "gaussians.safetensors"), twin
+
+
+def capture_of(folder: Path) -> Path | None:
+    """The capture that a run was made from; None where it is gone."""
+    path = folder / "config.json"
+    known = _read_json(path).get("capture") if path.is_file() else None
+    return Path(known) if isinstance(known, str) and Path(known).is_dir() else None
+
+
+def up_of(folder: Path) -> np.ndarray | None:
+    """Up (3,) as the photographs of a run have it; None where these are gone."""
+    capture = capture_of(folder)
+    with suppress(HingesplatError):
+        return None if capture is None else common_up(load_cameras(capture))
 
 
 def load_meshes(folder: Path, twin: Twin) -> dict[int, trimesh.Trimesh]:

@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from hingesplat.camera import Camera
+from hingesplat.camera import Camera, look_at
 from hingesplat.capture import View, write_state
 from hingesplat.errors import HingesplatError
 from hingesplat.synth.objects import MAKERS, Model
@@ -100,13 +100,7 @@ def cameras_around(rng: np.random.Generator, count: int, size: int, distance: fl
     for z, a in zip(height, turn, strict=True):
         r = np.sqrt(1 - z**2)
         eye = distance * rng.uniform(0.97, 1.1) * np.array([r * np.cos(a), r * np.sin(a), z])
-        forward = rng.uniform(-0.03, 0.03, 3) - eye
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0, 0, 1])
-        right /= np.linalg.norm(right)
-        T = np.eye(4)
-        T[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
-        T[:3, 3] = eye
+        T = look_at(eye, rng.uniform(-0.03, 0.03, 3), np.array([0, 0, 1]))
         cameras.append(Camera(T, focal, focal, size / 2, size / 2, size, size))
     return [cameras[k] for k in rng.permutation(count)]
 
