@@ -182,7 +182,9 @@ def encode_gif(pictures: Sequence[Image.Image], fps: float = 20) -> bytes:
     # A frame lasts whole hundredths of a second: some longer, some shorter, so that the whole keeps time.
     lengths = np.diff(np.round(np.arange(len(indexed) + 1) * 100 / fps)).astype(int) * 10
     file = io.BytesIO()
-    indexed[0].save(file, "GIF", save_all=True, append_images=indexed[1:], duration=lengths.tolist(), loop=0, disposal=1)
+    indexed[0].save(
+        file, "GIF", save_all=True, append_images=indexed[1:], duration=lengths.tolist(), loop=0, disposal=1
+    )
     return file.getvalue()
 
 

@@ -26,7 +26,7 @@ import trimesh
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from hingesplat.articulate import ArticulateConfig, Articulation, articulate
+from hingesplat.articulate import ArticulateConfig, Articulation, articulate, draw_repel_points
 from hingesplat.camera import common_up
 from hingesplat.capture import Capture, View, load_cameras
 from hingesplat.capture.images import downsampled
@@ -410,6 +410,18 @@ def capture_of(folder: Path) -> Path | None:
     path = folder / "config.json"
     known = _read_json(path).get("capture") if path.is_file() else None
     return Path(known) if isinstance(known, str) and Path(known).is_dir() else None
+
+
+def repel_points_of(folder: Path) -> np.ndarray:
+    """Repel points (n, 3) as ``articulate`` draws them, where a run used them; else none."""
+    told = _read_json(folder / "config.json").get("articulate", {}) if (folder / "config.json").is_file() else {}
+    if not told.get("repel") or not (folder / "canonical.safetensors").is_file():
+        return np.zeros((0, 3), np.float32)
+    config = replace(ArticulateConfig(), repel=True, repel_points=told["repel_points"])
+    drawn = draw_repel_points(
+        Gaussians.load(folder / "canonical.safetensors"), config, torch.Generator().manual_seed(0)
+    )
+    return np.zeros((0, 3), np.float32) if drawn is None else drawn.numpy()
 
 
 def up_of(folder: Path) -> np.ndarray | None:

@@ -154,12 +154,11 @@ def _shot(what: What, time: float, joints: Sequence[Joint]) -> Shot:
     return 0.0, sweep_values(joints, time)
 
 
-def _cameras(
-    gaussians: Gaussians, twin: Twin, shots: Sequence[Shot], up: np.ndarray, size: int
-) -> list[Camera]:
+def _cameras(gaussians: Gaussians, twin: Twin, shots: Sequence[Shot], up: np.ndarray, size: int) -> list[Camera]:
     """A camera a shot, all at one distance from the resting object's middle: as close as no shot is cut off."""
     rest, widest = (
-        posed(gaussians, twin.transforms(values)) for values in ({}, {j.child: max(j.limits, key=abs) for j in twin.joints})
+        posed(gaussians, twin.transforms(values))
+        for values in ({}, {j.child: max(j.limits, key=abs) for j in twin.joints})
     )
     low, high = np.quantile(rest.means.double().numpy(), [0.002, 0.998], axis=0)
     centre, extent = (low + high) / 2, float(np.linalg.norm(high - low))
