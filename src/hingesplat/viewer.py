@@ -172,7 +172,7 @@ class Photographs:
         with gui.add_folder("Photographs"):
             self._state = gui.add_dropdown("State", [state.name for state in capture.states])
             self._number = gui.add_slider("Photograph", 1, 2, 1, 1)
-            self._name = gui.add_markdown("")
+            self._caption = gui.add_markdown("")
             self._image = gui.add_image(np.full((PHOTO // 2, PHOTO, 3), 255, np.uint8))
             look = gui.add_button("Look from there", icon=viser.Icon.CAMERA)
         self._state.on_update(lambda _: self._fit_slider())
@@ -193,6 +193,15 @@ class Photographs:
         views = self.capture.states[self.state].train
         return views[min(self._number.value, len(views)) - 1]
 
+    @property
+    def picture(self) -> np.ndarray:
+        """What stands there now, (height, width, 3) uint8."""
+        return self._image.image
+
+    @property
+    def caption(self) -> str:
+        return self._caption.content
+
     def choose(self, state: int, number: int) -> None:
         """Show a training photograph of a state; both count from 0."""
         self._state.value, self._number.value = self.capture.states[state].name, number + 1
@@ -206,7 +215,7 @@ class Photographs:
         row = [x for p in pictures for x in (gap, np.asarray(p))][1:]
         with self._server.atomic():
             self._image.image = np.concatenate(row, axis=1)
-            self._name.content = f"`{view.name}`" + (" · the twin from there" if beside else "")
+            self._caption.content = f"`{view.name}`" + (" · the twin from there" if beside else "")
 
     def _fit_slider(self) -> None:
         self._number.max = len(self.capture.states[self.state].train)
@@ -344,8 +353,10 @@ class TwinView:
                 )
         gui = self.server.gui
         with gui.add_folder("Show"):
-            look = gui.add_dropdown("Parts as", [look for look in LOOKS if looks[look]])
-            _follow(look, lambda: [(node, look.value == name) for name, nodes in looks.items() for node in nodes])
+            self.look = gui.add_dropdown("Parts as", [look for look in LOOKS if looks[look]])
+            _follow(
+                self.look, lambda: [(node, self.look.value == name) for name, nodes in looks.items() for node in nodes]
+            )
             if self.joints:
                 axes = gui.add_checkbox("Joint axes", True)
                 arrows = [self._add_axis(joint) for joint in self.joints]
@@ -438,8 +449,8 @@ def _surface(points: np.ndarray, voxel: float) -> tuple[np.ndarray, np.ndarray]:
     cells = np.round((points - points.min(0)) / voxel).astype(int) + 2
     full = np.zeros(cells.max(0) + 3)
     full[tuple(cells.T)] = 1
-    slopes: Sequence[np.ndarray] = np.gradient(ndimage.gaussian_filter(full, 1.5))
-    outward = -np.stack([slope[tuple(cells.T)] for slope in slopes], 1)
+    smooth = ndimage.gaussian_filter(full, 1.5)
+    outward = -np.stack([np.asarray(ndimage.sobel(smooth, axis))[tuple(cells.T)] for axis in range(3)], 1)
     outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
     outer = np.asarray(ndimage.binary_erosion(full))[tuple(cells.T)] == 0
     return points[outer], outward[outer]
