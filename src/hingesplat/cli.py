@@ -250,8 +250,8 @@ class View:
     def run(self, console: Console) -> None:
         from hingesplat.viewer import open_viewer
 
-        with open_viewer(self.folder, host=self.host, port=self.port) as url:
-            console.print(f"{url} shows {escape(str(self.folder))}; Ctrl-C ends it", soft_wrap=True)
+        with open_viewer(self.folder, host=self.host, port=self.port) as viewer:
+            console.print(f"{viewer.url} shows {escape(str(self.folder))}; Ctrl-C ends it", soft_wrap=True)
             with suppress(KeyboardInterrupt):
                 threading.Event().wait()
 

@@ -171,11 +171,12 @@ def _cameras(gaussians: Gaussians, twin: Twin, shots: Sequence[Shot], up: np.nda
     start = max(2 * math.pi * np.arange(24) / 24, key=lambda a: movable_share(widest, camera(a, 2.5 * extent)))
     rows = (gaussians.opacities > 0.3).nonzero()[:, 0]
     solid = gaussians[rows[:: len(rows) // 4000 + 1]]
+    reach = 2 * solid.scales.amax(1).double().numpy()
     distance = extent  # Should hardly anything be solid.
     for turn, values in shots[:: len(shots) // 48 + 1]:
         points = posed(solid, twin.transforms(values)).means.double().numpy() - centre
         x, y, z = (points @ camera(start + turn, 1).T_world_camera[:3, :3]).T
-        needed = np.maximum(abs(x), abs(y)) / (FILLED * half) - z
+        needed = (np.maximum(abs(x), abs(y)) + reach) / (FILLED * half) - z
         distance = max(distance, float(np.quantile(needed, 0.999)))
     return [camera(start + turn, distance) for turn, _ in shots]
 

@@ -103,11 +103,14 @@ def open_viewer(path: Path, *, host: str = "127.0.0.1", port: int = 8080) -> Vie
 
 def _serve(host: str, port: int) -> viser.ViserServer:
     """viser would try the next ports by itself, and wait for ever where it may have none."""
+    if not 0 <= port < 2**16:
+        raise HingesplatError(f"port: must be 0 to 65535, not {port}")
     try:
         socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
-    except (OSError, OverflowError) as e:
-        reason = getattr(e, "strerror", None) or e
-        raise HingesplatError(f"cannot listen on {host}, port {port}: {reason}; choose with --host and --port") from e
+    except OSError as e:
+        raise HingesplatError(
+            f"cannot listen on {host}, port {port} ({e.strerror}); give another --host or --port"
+        ) from e
     with redirect_stdout(io.StringIO()):  # It greets, quiet or not.
         return viser.ViserServer(host=host, port=port, verbose=False)
 
