@@ -21,7 +21,7 @@ from PIL import Image
 from hingesplat import cli
 from hingesplat.gaussians import Gaussians, concatenate
 from hingesplat.twin import Joint, Part, Twin
-from scenes import box_surface, one_thread, sheet
+from scenes import box_surface, look_at, one_thread, sheet
 
 pytest.importorskip("viser", reason="viser is not installed")
 from hingesplat.viewer import CaptureView, TwinView, Viewer, open_viewer
@@ -267,7 +267,7 @@ KNOWN = ("computeBoundingSphere(): Computed radius is NaN", "net::ERR_FILE_NOT_F
 
 
 def test_in_a_browser_a_slider_moves_its_part_and_not_the_base(viewer: Viewer, twin_view: TwinView, browser) -> None:
-    page = browser.new_page(viewport={"width": 800, "height": 500})
+    page = browser.new_page(viewport={"width": 800, "height": 500}, accept_downloads=True)
     errors, elsewhere = [], []
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.on("console", lambda m: m.type == "error" and not any(k in m.text for k in KNOWN) and errors.append(m.text))
@@ -294,9 +294,18 @@ def test_in_a_browser_a_slider_moves_its_part_and_not_the_base(viewer: Viewer, t
         page.keyboard.press("End")
         until(lambda: twin_view.values[1] == 1.03)
         after = canvas()
+        with page.expect_download(timeout=60_000) as download:
+            page.get_by_role("button", name="Screenshot").click()
+        with Image.open(download.value.path()) as image:
+            shot = np.array(image)
+        client = next(iter(viewer.server.get_clients().values()))
+        twin_view.stage.look_through(client, camera := look_at(np.array([1.0, -3.0, 1.0]), 100))
+        seen_from = client.camera.position / twin_view.stage.scale
     finally:
         page.close()
     assert errors == [] and elsewhere == []
+    assert shot.shape[2] == 4 and 0.02 < (shot[..., 3] > 200).mean() < 0.9
+    assert seen_from == pytest.approx(camera.centre) and client.camera.fov > 2 * np.arctan(0.5 / 1.4) - 1e-6
 
     def of(picture: np.ndarray, channel: int) -> np.ndarray:
         rest = np.delete(picture, channel, axis=2).max(2)

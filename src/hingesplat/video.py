@@ -31,8 +31,8 @@ ELEVATION = math.radians(24)
 """Of the camera above the object's middle."""
 FILLED = 0.92
 """Share of the picture's side that the object takes where it is largest."""
-TOP, BOTTOM = 1.0, 0.9
-"""Grey of the background, which fades from one to the other."""
+BOTTOM = 0.9
+"""Grey to which the white background fades downwards."""
 
 
 def write_video(
@@ -62,7 +62,7 @@ def write_video(
         report: called with ``stage, step, steps`` after each picture.
 
     Raises:
-        HingesplatError: another suffix, numbers that make no sense, no joint to sweep, no encoder, or no such folder.
+        HingesplatError: another suffix, numbers that make no sense, no joint to sweep, or no encoder.
     """
     frames = _check(path, size, fps, seconds)
     joints = [j for j in twin.joints if j.type != "fixed"]
@@ -73,7 +73,8 @@ def write_video(
         what = "orbit"
     shots = [_shot(what, i / frames, joints) for i in range(frames)]
     cameras = _cameras(gaussians, twin, shots, np.array([0.0, 0.0, 1.0]) if up is None else up, size)
-    backdrop = np.linspace(TOP, BOTTOM, size)[:, None, None]
+    # A GIF's 256 colours would turn the fading into bands.
+    backdrop = np.linspace(1, 1 if path.suffix == ".gif" else BOTTOM, size)[:, None, None]
 
     def draw() -> Iterator[np.ndarray]:
         for i, ((_, values), camera) in enumerate(zip(shots, cameras, strict=True)):
@@ -124,11 +125,12 @@ def _ffmpeg() -> str:
 
 def _write_mp4(path: Path, frames: Iterator[np.ndarray], size: int, fps: float) -> None:
     """H.264 that plays everywhere: 4:2:0, and tagged with the colours it has."""
+    colours = "colorspace=bt709:color_primaries=bt709:color_trc=bt709"
     command = [
         *(_ffmpeg(), "-v", "error", "-y"),
         *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size}x{size}", "-r", f"{fps:g}", "-i", "-"),
-        *("-vf", "scale=out_color_matrix=bt709:out_range=tv", "-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p"),
-        *("-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709"),
+        *("-vf", f"scale=out_color_matrix=bt709:out_range=tv,setparams={colours}"),
+        *("-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p"),
         *("-movflags", "+faststart", "-f", "mp4", str(path)),
     ]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
@@ -169,10 +171,10 @@ def _cameras(gaussians: Gaussians, twin: Twin, shots: Sequence[Shot], up: np.nda
         return Camera(T, size / 2 / half, size / 2 / half, size / 2, size / 2, size, size)
 
     start = max(2 * math.pi * np.arange(24) / 24, key=lambda a: movable_share(widest, camera(a, 2.5 * extent)))
-    rows = (gaussians.opacities > 0.3).nonzero()[:, 0]
+    rows = (gaussians.opacities >= min(0.3, float(gaussians.opacities.max()))).nonzero()[:, 0]
     solid = gaussians[rows[:: len(rows) // 4000 + 1]]
     reach = 2 * solid.scales.amax(1).double().numpy()
-    distance = extent  # Should hardly anything be solid.
+    distance = 0.0
     for turn, values in shots[:: len(shots) // 48 + 1]:
         points = posed(solid, twin.transforms(values)).means.double().numpy() - centre
         x, y, z = (points @ camera(start + turn, 1).T_world_camera[:3, :3]).T

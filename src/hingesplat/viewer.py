@@ -10,7 +10,7 @@ import math
 import socket
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from pathlib import Path
 from typing import Any
 
@@ -46,8 +46,7 @@ HULL = 64
 """Voxels along the longest side of a visual hull."""
 PERIOD = 3.0
 """Seconds in which a joint plays out and back."""
-SPLATS, MESHES = "splats", "meshes"
-LOOKS = (SPLATS, f"{SPLATS}, parts coloured", MESHES, f"{MESHES}, parts coloured")
+LOOKS = ("splats", "splats, parts coloured", "meshes", "meshes, parts coloured")
 RED = (0.86, 0.12, 0.24)
 
 
@@ -83,6 +82,7 @@ def open_viewer(path: Path, *, host: str = "127.0.0.1", port: int = 8080) -> Vie
     """
     if not path.is_dir():
         raise HingesplatError(f"{path}: {'is not a folder' if path.exists() else 'does not exist'}")
+    _check_address(host, port)
     if (path / "twin.json").is_file():
         show = _open_run(path)
     elif (path / "config.json").is_file():
@@ -93,7 +93,8 @@ def open_viewer(path: Path, *, host: str = "127.0.0.1", port: int = 8080) -> Vie
         except HingesplatError as e:
             raise HingesplatError(f"{path}: is no run, for it has no twin.json, and no capture ({e})") from e
         show = _open_capture(path)
-    server = _serve(host, port)
+    with redirect_stdout(io.StringIO()):  # It greets, quiet or not.
+        server = viser.ViserServer(host=host, port=port, verbose=False)
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     server.gui.set_panel_label(f"hingesplat · {path.resolve().name}")
     server.gui.main_panel.dock_left()
@@ -101,18 +102,15 @@ def open_viewer(path: Path, *, host: str = "127.0.0.1", port: int = 8080) -> Vie
     return Viewer(server, show(server))
 
 
-def _serve(host: str, port: int) -> viser.ViserServer:
+def _check_address(host: str, port: int) -> None:
     """viser would try the next ports by itself, and wait for ever where it may have none."""
     if not 0 <= port < 2**16:
         raise HingesplatError(f"port: must be 0 to 65535, not {port}")
     try:
         socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
     except OSError as e:
-        raise HingesplatError(
-            f"cannot listen on {host}, port {port} ({e.strerror}); give another --host or --port"
-        ) from e
-    with redirect_stdout(io.StringIO()):  # It greets, quiet or not.
-        return viser.ViserServer(host=host, port=port, verbose=False)
+        remedy = "give another --host or --port"
+        raise HingesplatError(f"cannot listen on {host}, port {port} ({e.strerror}); {remedy}") from e
 
 
 def _open_run(folder: Path) -> "Callable[[viser.ViserServer], TwinView]":
@@ -120,7 +118,7 @@ def _open_run(folder: Path) -> "Callable[[viser.ViserServer], TwinView]":
     meshes, repel, source = load_meshes(folder, twin), repel_points_of(folder), capture_of(folder)
     capture = None
     try:
-        capture = load_capture(source) if source else None
+        capture = load_capture(source, max_size=PHOTO) if source else None
     except HingesplatError as e:
         log.warning("without its photographs: %s", e)
     return lambda server: TwinView(server, gaussians, twin, meshes, repel, capture)
@@ -494,10 +492,11 @@ def _follow(control: Any, visible: Callable[[], Iterable[tuple[Any, bool]]]) -> 
 
 def _screenshot(client: viser.ClientHandle) -> None:
     """What the client sees, as a file it saves; transparent behind the object."""
-    picture = client.get_render(client.camera.image_height, client.camera.image_width, transport_format="png")
     file = io.BytesIO()
-    Image.fromarray(picture).save(file, "PNG")
-    client.send_file_download("hingesplat.png", file.getvalue(), save_immediately=True)
+    with suppress(RuntimeError):  # The page is closed before it has answered.
+        seen = client.get_render(client.camera.image_height, client.camera.image_width, transport_format="png")
+        Image.fromarray(seen).save(file, "PNG")
+        client.send_file_download("hingesplat.png", file.getvalue(), save_immediately=True)
 
 
 def _add_splats(scene: viser.SceneApi, name: str, g: Gaussians, scale: float) -> Any:
