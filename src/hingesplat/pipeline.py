@@ -407,21 +407,8 @@ def load_result(folder: Path) -> tuple[Gaussians, Twin]:
 
 def capture_of(folder: Path) -> Path | None:
     """The capture that a run was made from; None where it is gone."""
-    path = folder / "config.json"
-    known = _read_json(path).get("capture") if path.is_file() else None
+    known = _config_of(folder).get("capture")
     return Path(known) if isinstance(known, str) and Path(known).is_dir() else None
-
-
-def repel_points_of(folder: Path) -> np.ndarray:
-    """Repel points (n, 3) as ``articulate`` draws them, where a run used them; else none."""
-    told = _read_json(folder / "config.json").get("articulate", {}) if (folder / "config.json").is_file() else {}
-    if not told.get("repel") or not (folder / "canonical.safetensors").is_file():
-        return np.zeros((0, 3), np.float32)
-    config = replace(ArticulateConfig(), repel=True, repel_points=told["repel_points"])
-    drawn = draw_repel_points(
-        Gaussians.load(folder / "canonical.safetensors"), config, torch.Generator().manual_seed(0)
-    )
-    return np.zeros((0, 3), np.float32) if drawn is None else drawn.numpy()
 
 
 def up_of(folder: Path) -> np.ndarray | None:
@@ -429,6 +416,21 @@ def up_of(folder: Path) -> np.ndarray | None:
     capture = capture_of(folder)
     with suppress(HingesplatError):
         return None if capture is None else common_up(load_cameras(capture))
+
+
+def repel_points_of(folder: Path) -> np.ndarray:
+    """Repel points (n, 3) as ``articulate`` draws them, where a run used them; else none."""
+    told, path = _config_of(folder).get("articulate", {}), folder / "canonical.safetensors"
+    drawn = None
+    if told.get("repel") and path.is_file():
+        config = ArticulateConfig(repel=True, repel_points=told["repel_points"])
+        drawn = draw_repel_points(Gaussians.load(path), config, torch.Generator().manual_seed(0))
+    return np.zeros((0, 3), np.float32) if drawn is None else drawn.numpy()
+
+
+def _config_of(folder: Path) -> dict[str, Any]:
+    path = folder / "config.json"
+    return _read_json(path) if path.is_file() else {}
 
 
 def load_meshes(folder: Path, twin: Twin) -> dict[int, trimesh.Trimesh]:
