@@ -34,5 +34,5 @@ bench: .venv/stamp-dev  ## measure, write benchmarks/results/, and set the table
 	@touch $@
 
 .venv/stamp-dev: .venv/stamp-torch pyproject.toml
-	$(PIP_INSTALL) -e '.[dev,sim,usd,splats]'
+	$(PIP_INSTALL) -e '.[dev,sim,usd,splats,view,video]'
 	@touch $@ .venv/stamp-run

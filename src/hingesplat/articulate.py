@@ -115,7 +115,7 @@ def articulate(
     extra = {"state_sh": (torch.zeros((len(canonical), len(views) - 1, 3)), config.rates.sh)}
     optimiser = GaussianAdam(canonical, config.rates, extent, extra | identity.extra)
     training = [[training_view(v) for v in state] for state in views]
-    repel_points = _repel_points(canonical, config, generator)
+    repel_points = draw_repel_points(canonical, config, generator)
     photographs = shuffled(training, rng)
     statistics = torch.zeros((len(optimiser), 3))
     targets: list[_Targets] = []
@@ -222,7 +222,8 @@ class _Identity:
         return True
 
 
-def _repel_points(g: Gaussians, config: ArticulateConfig, generator: torch.Generator) -> Tensor | None:
+def draw_repel_points(g: Gaussians, config: ArticulateConfig, generator: torch.Generator) -> Tensor | None:
+    """Points (n, 3) of the base that movable Gaussians are pushed off; None where the config wants none."""
     if not config.repel or not (g.part > 0).any():
         return None
     base = g.part == 0

@@ -4,6 +4,7 @@ import logging
 import os
 import sys
 import tempfile
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -11,7 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, make_dataclass, replace
 from math import degrees
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from rich.box import SIMPLE_HEAD
@@ -187,9 +188,10 @@ class Export:
 
     def run(self, console: Console) -> None:
         from hingesplat.export.check import check_export
-        from hingesplat.pipeline import load_result
+        from hingesplat.pipeline import load_meshes, load_result
 
-        twin, meshes, gaussians = load_result(self.run_folder)
+        gaussians, twin = load_result(self.run_folder)
+        meshes = load_meshes(self.run_folder, twin)
         home = self.run_folder / "export"
         paths = export_twin(twin, meshes, gaussians, self.out or home, self.format, self.options, cache=home / ".hulls")
         for form, path in paths.items():
@@ -198,7 +200,68 @@ class Export:
                 show_check(console, form, check)
 
 
-Command = Reconstruct | Demo | Evaluate | Synth | Export
+@dataclass(frozen=True)
+class Render:
+    """Film a run's twin, drawn from its splats: around it, its joints moving, or one after the other."""
+
+    run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """A run folder."""
+    out: Path
+    """The film: .mp4 or .gif."""
+    what: Literal["orbit", "sweep", "both"] = "both"
+    """Once around it; the joints through their range and back; both, one after the other."""
+    size: int = 720
+    """Width and height, pixels."""
+    fps: float = 30
+    """Pictures a second."""
+    seconds: float = 8
+    """Of the whole film, which loops."""
+    quiet: bool = False
+    """Say nothing but warnings and errors."""
+
+    def run(self, console: Console) -> None:
+        from hingesplat.pipeline import load_result, up_of
+        from hingesplat.video import write_video
+
+        gaussians, twin = load_result(self.run_folder)
+        with StageProgress(console) as report:
+            write_video(
+                self.out,
+                gaussians,
+                twin,
+                what=self.what,
+                up=up_of(self.run_folder),
+                size=self.size,
+                fps=self.fps,
+                seconds=self.seconds,
+                report=report,
+            )
+        console.print(f"written: {escape(str(self.out))}", soft_wrap=True)
+
+
+@dataclass(frozen=True)
+class View:
+    """Look at a run (splats, meshes, joints on sliders, photographs) or a capture (cameras, hulls) in the browser."""
+
+    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN|CAPTURE")]
+    """A run folder or a capture."""
+    host: str = "127.0.0.1"
+    """Address to listen on; 0.0.0.0 lets other machines in."""
+    port: int = 8080
+    """Port to listen on."""
+    quiet: bool = False
+    """Say nothing but warnings and errors."""
+
+    def run(self, console: Console) -> None:
+        from hingesplat.viewer import open_viewer
+
+        with open_viewer(self.folder, host=self.host, port=self.port) as viewer:
+            console.print(f"{viewer.url} shows {escape(str(self.folder))}; Ctrl-C ends it", soft_wrap=True)
+            with suppress(KeyboardInterrupt):
+                threading.Event().wait()
+
+
+Command = Reconstruct | Demo | Evaluate | Synth | Export | View | Render
 
 
 def main(argv: Sequence[str] | None = None) -> int:

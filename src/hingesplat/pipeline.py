@@ -26,8 +26,9 @@ import trimesh
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from hingesplat.articulate import ArticulateConfig, Articulation, articulate
-from hingesplat.capture import Capture, View
+from hingesplat.articulate import ArticulateConfig, Articulation, articulate, draw_repel_points
+from hingesplat.camera import common_up
+from hingesplat.capture import Capture, View, load_cameras
 from hingesplat.capture.images import downsampled
 from hingesplat.errors import HingesplatError
 from hingesplat.export import export_twin
@@ -38,8 +39,7 @@ from hingesplat.fuse import FuseConfig, fuse
 from hingesplat.gaussians import Gaussians, posed
 from hingesplat.joints import JointsConfig, find_joints
 from hingesplat.mesh import MeshConfig, mesh_parts
-from hingesplat.pictures import write_motion_gif, write_summary
-from hingesplat.render import render
+from hingesplat.pictures import movable_share, write_motion_gif, write_summary
 from hingesplat.search import Motion
 from hingesplat.segment import Segmentation, SegmentConfig, segment, track
 from hingesplat.twin import Joint, Part, Twin
@@ -292,7 +292,7 @@ def _joints(run: Run) -> None:
 
 
 def _mesh(run: Run) -> None:
-    gaussians, twin = _result(run)
+    gaussians, twin = load_result(run.folder)
     states = [([v.camera for v in views], twin.at_state(t)) for t, views in enumerate(run.views)]
     meshes = mesh_parts(gaussians, states, run.config.mesh)
     parts = []
@@ -309,12 +309,12 @@ def _mesh(run: Run) -> None:
 
 
 def _export(run: Run) -> None:
-    twin, meshes, gaussians = load_result(run.folder)
-    export_twin(twin, meshes, gaussians, run / "export")
+    gaussians, twin = load_result(run.folder)
+    export_twin(twin, load_meshes(run.folder, twin), gaussians, run / "export")
 
 
 def _pictures(run: Run) -> None:
-    gaussians, twin = _result(run)
+    gaussians, twin = load_result(run.folder)
     poses = [twin.at_state(t) for t in range(len(run.capture.states))]
     best = [telling_view(posed(gaussians, T), views) for T, views in zip(poses, run.views, strict=True)]
     write_summary(run / "summary.png", gaussians, list(zip(best, poses, strict=True)))
@@ -338,10 +338,6 @@ STAGES: dict[str, Callable[[Run], None]] = {
 
 def _fitted(run: Run, state: int) -> Gaussians:
     return Gaussians.load(run / f"fit_state{state}.safetensors")
-
-
-def _result(run: Run) -> tuple[Gaussians, Twin]:
-    return Gaussians.load(run / "gaussians.safetensors"), Twin.load(run / "twin.json")
 
 
 def _check(config: ReconstructConfig) -> None:
@@ -389,31 +385,51 @@ def coloured(gaussians: Gaussians, offset: Tensor) -> Gaussians:
     return replace(gaussians, sh=sh).detached()
 
 
-@torch.no_grad()
-def telling_view(gaussians: Gaussians, views: Sequence[View], size: int = 64) -> View:
+def telling_view(gaussians: Gaussians, views: Sequence[View]) -> View:
     """The photograph in which the movable parts cover most pixels; the first one if nothing moves."""
-
-    def covered(view: View) -> float:
-        shrink = size / max(view.camera.width, view.camera.height)
-        w, h = (max(1, round(side * shrink)) for side in (view.camera.width, view.camera.height))
-        movable = (gaussians.part > 0).to(gaussians.means)[:, None]
-        return float(render(gaussians, view.camera.scaled(w, h), channels=movable).channels.mean())
-
-    return max(views, key=covered)
+    return max(views, key=lambda view: movable_share(gaussians, view.camera))
 
 
-def load_result(folder: Path) -> tuple[Twin, dict[int, trimesh.Trimesh], Gaussians]:
-    """The twin of a finished run, its part meshes by part id, and its Gaussians, all in state 0.
+def load_result(folder: Path) -> tuple[Gaussians, Twin]:
+    """The Gaussians, frame of state 0, and the twin of a run.
 
     Raises:
-        HingesplatError: the folder holds no twin, a run that has not come so far, or something broken.
+        HingesplatError: no such run, one that has not come this far, or something broken.
     """
-    path = folder / "twin.json"
-    early = (folder / "stages.json").is_file() and not path.is_file()
-    twin = None if early else Twin.load(path)
-    if twin is None or all(part.mesh is None for part in twin.parts):
+    if not folder.is_dir():
+        raise HingesplatError(f"{folder}: no such run folder")
+    if (folder / "stages.json").is_file() and not (folder / "twin.json").is_file():
         raise HingesplatError(f"{folder}: its run is not finished; give the same `hingesplat reconstruct` again")
-    return twin, load_meshes(folder, twin), Gaussians.load(folder / "gaussians.safetensors")
+    twin = Twin.load(folder / "twin.json")
+    return Gaussians.load(folder / "gaussians.safetensors"), twin
+
+
+def capture_of(folder: Path) -> Path | None:
+    """The capture that a run was made from; None where it is gone."""
+    known = _config_of(folder).get("capture")
+    return Path(known) if isinstance(known, str) and Path(known).is_dir() else None
+
+
+def up_of(folder: Path) -> np.ndarray | None:
+    """Up (3,) as the photographs of a run have it; None where these are gone."""
+    capture = capture_of(folder)
+    with suppress(HingesplatError):
+        return None if capture is None else common_up(load_cameras(capture))
+
+
+def repel_points_of(folder: Path) -> np.ndarray:
+    """Repel points (n, 3) as ``articulate`` draws them, where a run used them; else none."""
+    told, path = _config_of(folder).get("articulate", {}), folder / "canonical.safetensors"
+    drawn = None
+    if told.get("repel") and path.is_file():
+        config = ArticulateConfig(repel=True, repel_points=told["repel_points"])
+        drawn = draw_repel_points(Gaussians.load(path), config, torch.Generator().manual_seed(0))
+    return np.zeros((0, 3), np.float32) if drawn is None else drawn.numpy()
+
+
+def _config_of(folder: Path) -> dict[str, Any]:
+    path = folder / "config.json"
+    return _read_json(path) if path.is_file() else {}
 
 
 def load_meshes(folder: Path, twin: Twin) -> dict[int, trimesh.Trimesh]:

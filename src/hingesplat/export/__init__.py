@@ -65,7 +65,7 @@ def export_twin(
         The file to open, by format.
 
     Raises:
-        HingesplatError: an unknown format; something else in the way of a folder; the joints form no tree; a
+        HingesplatError: an unknown format; no mesh; something else in the way of a folder; the joints form no tree; a
             number in the config makes no sense; a package that a format needs is absent.
     """
     from hingesplat.export.links import build_links, placement
@@ -77,6 +77,8 @@ def export_twin(
         if form not in FORMATS:
             raise HingesplatError(f"format: unknown {form!r}; use {', '.join(FORMATS)}")
         _check_free(out / form)
+    if not meshes:
+        raise HingesplatError("no part has a mesh: the run is not finished; give its `hingesplat reconstruct` again")
     links = build_links(twin, meshes, config, cache or out / ".hulls")
     placed = transformed(gaussians, *placement(twin, config))
     note = {"hingesplat": hingesplat.__version__, **vars(config), "metres_per_unit": twin.metres_per_unit}

@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from hingesplat.camera import Camera
+from hingesplat.camera import Camera, look_at
 from hingesplat.capture import View, write_state
 from hingesplat.errors import HingesplatError
 from hingesplat.synth.model import Model
@@ -122,13 +122,7 @@ def cameras_around(
 
 def camera_at(eye: np.ndarray, target: np.ndarray, size: int) -> Camera:
     """A camera at ``eye`` that looks at ``target``, z up, with square pictures of ``size`` pixels."""
-    forward = target - eye
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
-    T[:3, 3] = eye
+    T = look_at(eye, target, np.array([0, 0, 1]))
     focal = size / 2 / np.tan(FIELD_OF_VIEW / 2)
     return Camera(T, focal, focal, size / 2, size / 2, size, size)
 
