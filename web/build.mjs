@@ -1,7 +1,9 @@
 // Bundles src/main.js with three and Spark into the one file that the Python package ships.
 import { build } from "esbuild";
-import { readFileSync } from "node:fs";
+import { createHash } from "node:crypto";
+import { readFileSync, readdirSync, writeFileSync } from "node:fs";
 
+const bundle = "../src/hingesplat/report/bundle.js";
 const packages = ["three", "@sparkjsdev/spark", "fflate"];
 const notices = packages.map(
   (name) => `${name}\n\n${readFileSync(`node_modules/${name}/LICENSE`, "utf8").trim()}`,
@@ -9,7 +11,7 @@ const notices = packages.map(
 
 await build({
   entryPoints: ["src/main.js"],
-  outfile: "../src/hingesplat/report/bundle.js",
+  outfile: bundle,
   bundle: true,
   minify: true,
   format: "iife",
@@ -19,3 +21,10 @@ await build({
   define: { "import.meta.url": '"about:blank"' },
   banner: { js: `/*\n${notices.join("\n\n---\n\n").replaceAll("*/", "* /")}\n*/` },
 });
+
+// What the bundle was made from, as `cd web && sha256sum -c bundle.sha256` checks it: a stale bundle fails a test.
+const sources = readdirSync("src").map((name) => `src/${name}`);
+const lines = ["build.mjs", "package.json", "package-lock.json", ...sources.sort(), bundle].map(
+  (path) => `${createHash("sha256").update(readFileSync(path)).digest("hex")}  ${path}\n`,
+);
+writeFileSync("bundle.sha256", lines.join(""));

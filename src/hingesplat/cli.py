@@ -81,6 +81,7 @@ class Demo:
     def run(self, console: Console) -> None:
         from hingesplat.capture import load_capture
         from hingesplat.metrics import evaluate
+        from hingesplat.report import write_report
 
         started = time.perf_counter()
         capture, run = self.out / "capture", self.out / "run"
@@ -89,6 +90,7 @@ class Demo:
         twin = _reconstruct(load_capture(capture), demo_config(), run, True, console)
         show_joints(console, twin)
         show_metrics(console, evaluate(run, capture / "truth"))
+        write_report(run)
         show_paths(console, run)
         console.print(f"{time.perf_counter() - started:.0f} s in all")
 
@@ -108,7 +110,7 @@ def demo_config() -> "ReconstructConfig":
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Compare a run with the truth; every number goes to RUN/metrics.json."""
+    """Compare a run with the truth; every number goes to RUN/metrics.json, and into RUN/report.html."""
 
     run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """A run folder."""
@@ -119,8 +121,10 @@ class Evaluate:
 
     def run(self, console: Console) -> None:
         from hingesplat.metrics import evaluate
+        from hingesplat.report import write_report
 
         show_metrics(console, evaluate(self.run_folder, self.truth))
+        write_report(self.run_folder)
         console.print(f"written: {escape(str(self.run_folder / 'metrics.json'))}", soft_wrap=True)
 
 
@@ -194,7 +198,22 @@ class Export:
             console.print(f"written: {escape(str(path))}", soft_wrap=True)
 
 
-Command = Reconstruct | Demo | Evaluate | Synth | Export
+@dataclass(frozen=True)
+class Report:
+    """Write RUN/report.html anew: the twin with sliders, joints, pictures, curves, in one file for any browser."""
+
+    run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """A run folder."""
+    quiet: bool = False
+    """Say nothing but warnings and errors."""
+
+    def run(self, console: Console) -> None:
+        from hingesplat.report import write_report
+
+        console.print(f"written: {escape(str(write_report(self.run_folder)))}", soft_wrap=True)
+
+
+Command = Reconstruct | Demo | Evaluate | Synth | Export | Report
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -386,6 +405,7 @@ def show_paths(console: Console, run: Path) -> None:
     """What a run wrote and what it is for."""
     table = Table.grid(padding=(0, 2))
     for name, what in {
+        "report.html": "the twin in a browser",
         "twin.json": "parts and joints",
         "parts": "splats and meshes",
         "export/twin.urdf": "for robotics",

@@ -1,8 +1,7 @@
-"""Pictures for people: ``summary.png`` (photographs, renders, parts), ``motion.gif`` (the joints moving), ``views/``."""
+"""Pictures for people: ``summary.png`` (photographs, renders, parts), ``motion.gif`` (the joints moving)."""
 
 import colorsys
 import io
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -60,61 +59,12 @@ def write_summary(
     for view, poses in states:
         camera = _fitted(view.camera, size)
         scene = posed(gaussians.detached(), poses)
-        photo = _shrunk(view, camera)
-        photo = Image.alpha_composite(Image.new("RGBA", photo.size, "white"), photo).convert("RGB")
+        photo = Image.fromarray(view.rgba, "RGBA")
+        white = Image.new("RGBA", photo.size, "white")
+        photo = Image.alpha_composite(white, photo).convert("RGB")
+        photo = photo.resize((camera.width, camera.height), Image.Resampling.LANCZOS)
         rows.append([photo, _picture(scene, camera), _picture(in_part_colours(scene), camera)])
     _save(path, lambda file: _grid(rows, ("photograph", "twin", "parts")).save(file, "PNG"))
-
-
-def spread_views(views: Sequence[View], first: View, count: int) -> list[View]:
-    """At most ``count`` of the views, ``first`` and then each time the one that looks from farthest aside."""
-    directions = np.stack([v.camera.T_world_camera[:3, 2] for v in views])
-    nearest = directions @ first.camera.T_world_camera[:3, 2]
-    chosen = [first]
-    while len(chosen) < min(count, len(views)):
-        i = int(nearest.argmin())
-        chosen.append(views[i])
-        nearest = np.maximum(nearest, directions @ directions[i])
-    return chosen
-
-
-def write_views(
-    folder: Path,
-    gaussians: Gaussians,
-    states: Sequence[tuple[Sequence[View], Mapping[int, np.ndarray]]],
-    up: np.ndarray,
-    *,
-    held_out: bool,
-    size: int = 480,
-) -> None:
-    """Photographs and the twin from their cameras, cut out, as ``views.json`` and WebP pictures beside it.
-
-    Args:
-        folder: where they go; it exists.
-        gaussians: in state 0, with part ids.
-        states: for each state some photographs and its part poses, as ``Twin.at_state`` gives them.
-        up: (3,) away from the ground in the world frame.
-        held_out: whether the twin was made without these photographs.
-        size: longest side of each picture, pixels.
-    """
-    entries = []
-    for state, (views, poses) in enumerate(states):
-        scene = posed(gaussians.detached(), poses)
-        for number, view in enumerate(views):
-            camera = _fitted(view.camera, size)
-            photo = _shrunk(view, camera)
-            twin = _cut_out(scene, camera)
-            error = float(np.square(_on_white(photo) - _on_white(twin)).mean())
-            entry = {"state": state, "name": view.name, "psnr": -10 * math.log10(max(error, 1e-10))}
-            for what, picture in (("photo", photo), ("twin", twin)):
-                entry[what] = f"state{state}_{number}_{what}.webp"
-                picture.save(folder / entry[what], "WEBP", quality=85)
-            entry["size"] = [camera.width, camera.height]
-            entry["T_world_camera"] = view.camera.T_world_camera.tolist()
-            entry["fov_y_deg"] = math.degrees(2 * math.atan(view.camera.height / 2 / view.camera.fy))
-            entries.append(entry)
-    index = {"up": np.asarray(up).tolist(), "held_out": held_out, "views": entries}
-    _save(folder / "views.json", lambda file: file.write(json.dumps(index, indent=1).encode()))
 
 
 def write_motion_gif(
@@ -184,26 +134,6 @@ def _picture(gaussians: Gaussians, camera: Camera) -> Image.Image:
     with torch.no_grad():
         rgb: Tensor = render(gaussians, camera, background=torch.ones(3)).rgb
     return Image.fromarray((rgb.clamp(0, 1).permute(1, 2, 0).cpu().numpy() * 255).round().astype(np.uint8))
-
-
-def _shrunk(view: View, camera: Camera) -> Image.Image:
-    """The photograph at the camera's size, RGBA."""
-    return Image.fromarray(view.rgba, "RGBA").resize((camera.width, camera.height), Image.Resampling.LANCZOS)
-
-
-def _cut_out(gaussians: Gaussians, camera: Camera) -> Image.Image:
-    """The render with straight alpha, RGBA."""
-    with torch.no_grad():
-        image = render(gaussians, camera)
-        rgb = image.rgb / image.alpha.clamp(min=1e-4)
-        rgba = torch.cat([rgb, image.alpha[None]]).clamp(0, 1).permute(1, 2, 0)
-    return Image.fromarray((rgba.cpu().numpy() * 255).round().astype(np.uint8), "RGBA")
-
-
-def _on_white(picture: Image.Image) -> np.ndarray:
-    """(height, width, 3) in [0, 1]."""
-    rgba = np.asarray(picture, np.float64) / 255
-    return rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
 
 
 def _grid(rows: list[list[Image.Image]], titles: Sequence[str]) -> Image.Image:

@@ -27,6 +27,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from hingesplat.articulate import ArticulateConfig, Articulation, articulate
+from hingesplat.camera import common_up
 from hingesplat.capture import Capture, View
 from hingesplat.capture.images import downsampled
 from hingesplat.errors import HingesplatError
@@ -38,9 +39,9 @@ from hingesplat.fuse import FuseConfig, fuse
 from hingesplat.gaussians import Gaussians, posed
 from hingesplat.joints import JointsConfig, find_joints
 from hingesplat.mesh import MeshConfig, mesh_parts
-from hingesplat.pictures import spread_views, write_motion_gif, write_summary, write_views
+from hingesplat.pictures import write_motion_gif, write_summary
 from hingesplat.render import render
-from hingesplat.report import write_report
+from hingesplat.report import spread_views, write_report, write_views
 from hingesplat.search import Motion
 from hingesplat.segment import Segmentation, SegmentConfig, segment, track
 from hingesplat.twin import Joint, Part, Twin
@@ -353,21 +354,21 @@ def _pictures(run: Run) -> None:
     best = [telling_view(posed(gaussians, T), views) for T, views in zip(poses, run.views, strict=True)]
     write_summary(run / "summary.png", gaussians, list(zip(best, poses, strict=True)))
     write_motion_gif(run / "motion.gif", gaussians, twin, best[-1].camera)
-    _show_views(run, gaussians, poses)
+    _show_views(run)
 
 
-def _show_views(run: Run, gaussians: Gaussians, poses: Sequence[dict[int, np.ndarray]]) -> None:
+def _show_views(run: Run) -> None:
     """Photographs for the report: those held back from the reconstruction if every state has some."""
     states = run.capture.states
     held_out = all(state.test for state in states)
     shown = []
-    for state, T in zip(states, poses, strict=True):
+    for t, state in enumerate(states):
         views = state.test if held_out else state.train
-        first = telling_view(posed(gaussians, T), views)
-        shown.append((spread_views(views, first, SHOWN_VIEWS), T))
-    up = -np.mean([v.camera.T_world_camera[:3, 1] for views in run.views for v in views], axis=0)
+        gaussians = Gaussians.load(run / f"gaussians_state{t}.safetensors")
+        shown.append((spread_views(views, telling_view(gaussians, views), SHOWN_VIEWS), gaussians))
+    up = common_up([view.camera for views in run.views for view in views])
     with whole_folder(run / "views") as folder:
-        write_views(folder, gaussians, shown, up, held_out=held_out)
+        write_views(folder, shown, up, held_out=held_out)
 
 
 STAGES: dict[str, Callable[[Run], None]] = {

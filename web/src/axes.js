@@ -29,8 +29,8 @@ export function axisOf(joint, colour, size) {
     const ends = [-0.55, 0.55].map((t) => pivot.clone().addScaledVector(axis, t));
     group.add(between(ends[0], ends[1], THIN, material), head(ends[1], axis, material));
     const faint = material.clone();
-    faint.opacity = 0.45;
-    const arc = new THREE.Mesh(new THREE.RingGeometry(0.1, 0.24, 48, 1, 0, high - low), faint);
+    faint.opacity = 0.3;
+    const arc = new THREE.Mesh(new THREE.RingGeometry(0, 0.3, 48, 1, 0, high - low), faint);
     faint.side = THREE.DoubleSide;
     arc.position.copy(pivot);
     // The sector starts where the part's outward direction is at its lowest value.

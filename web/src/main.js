@@ -46,6 +46,7 @@ function toggle(name, act) {
 
 async function start() {
   const scene = await openScene(stage, twin);
+  for (const child of joints.keys()) show(child, 0);
   scene.pose(values);
 
   let playing = false;

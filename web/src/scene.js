@@ -5,8 +5,9 @@ import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 import { axisOf } from "./axes.js";
 import { tinted } from "./tint.js";
 
-const FOV = 32;
-const MARGIN = 1.12; // of the ball that holds the object, around it
+const FOV = 30;
+const MARGIN = 1.12; // of the picture, around the outline of the twin
+const BLUR = 0.3; // square pixels that the rasteriser adds to every Gaussian
 
 function decoded(base64) {
   return Uint8Array.from(atob(base64), (c) => c.charCodeAt(0));
@@ -35,19 +36,32 @@ export async function openScene(stage, twin) {
   const camera = new THREE.PerspectiveCamera(FOV, 1, 0.01, 100);
   camera.up.set(...twin.up);
 
+  // One frame, and more while Spark sorts; data-still says that the picture is final.
   let wanted = false;
+  let loaded = false;
   function want() {
+    delete stage.dataset.still;
     if (wanted) return;
     wanted = true;
     requestAnimationFrame(() => {
       wanted = false;
+      soften();
       renderer.render(scene, camera);
-      stage.dataset.drawn = Number(stage.dataset.drawn ?? 0) + 1;
+      stage.dataset.frames = Number(stage.dataset.frames ?? 0) + 1;
+      if (!loaded || spark.sorting || spark.sortDirty) return;
+      stage.dataset.still = "";
+      stage.removeAttribute("aria-busy");
     });
   }
 
-  const spark = new SparkRenderer({ renderer, onDirty: want, sortRadial: false, preBlurAmount: 0.3, blurAmount: 0 });
+  const spark = new SparkRenderer({ renderer, onDirty: want, sortRadial: false, preBlurAmount: BLUR, blurAmount: 0 });
   scene.add(spark);
+
+  // What a pixel of the photographs blurs stays as soft where the screen has more pixels for it.
+  function soften() {
+    const pixel = (2 * Math.tan((FOV / 2) * (Math.PI / 180)) * camera.position.distanceTo(controls.target)) / canvas.height;
+    spark.preBlurAmount = BLUR * Math.max(1, twin.pixel / pixel) ** 2;
+  }
 
   const parts = new Map();
   for (const part of twin.parts) {
@@ -128,12 +142,24 @@ export async function openScene(stage, twin) {
     want();
   });
 
+  // From the side that the photograph shows, as near as the outline of the twin with its joints at their ends allows.
   function resetView() {
     const from = new THREE.Vector3(...twin.from).normalize();
-    const half = (FOV / 2) * (Math.PI / 180);
-    const narrow = Math.atan(Math.tan(half) * Math.min(1, camera.aspect));
-    controls.target.set(0, 0, 0);
-    camera.position.copy(from.multiplyScalar(MARGIN / Math.sin(narrow)));
+    camera.position.copy(from);
+    camera.lookAt(0, 0, 0);
+    const toCamera = camera.quaternion.clone().invert();
+    const points = twin.outline.map((point) => new THREE.Vector3(...point).applyQuaternion(toCamera));
+    // |p - middle| <= slope (distance - p.z) for every point, and equal for one on either side.
+    function fit(side, slope) {
+      const most = Math.max(...points.map((p) => p[side] + slope * p.z));
+      const least = Math.max(...points.map((p) => -p[side] + slope * p.z));
+      return [(most - least) / 2, (most + least) / 2 / slope];
+    }
+    const slope = Math.tan((FOV / 2) * (Math.PI / 180)) / MARGIN;
+    const [x, wide] = fit("x", slope * camera.aspect);
+    const [y, high] = fit("y", slope);
+    controls.target.set(x, y, 0).applyQuaternion(camera.quaternion);
+    camera.position.copy(controls.target).addScaledVector(from, Math.max(wide, high, 1));
     controls.update();
     want();
   }
@@ -151,7 +177,7 @@ export async function openScene(stage, twin) {
   }).observe(stage);
 
   await Promise.all([...parts.values()].map(({ splats }) => splats.initialized));
-  stage.removeAttribute("aria-busy");
+  loaded = true;
   want();
   return {
     pose,

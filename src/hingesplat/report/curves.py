@@ -10,26 +10,27 @@ SMOOTH = 7
 """Points that a line is averaged over: each step saw one photograph only, and some are harder than others."""
 
 
-def curve_figures(curves: dict[str, dict[str, list[float]]]) -> list[dict[str, Any]]:
-    """A chart for every stage and number, the states of a stage as lines of one chart.
+def chart_rows(curves: dict[str, dict[str, list[float]]]) -> list[list[dict[str, Any]]]:
+    """A row for every number, in it a chart for every stage, the states of a stage as lines of one chart.
 
     Args:
         curves: ``{stage or "stage state t": {"step": [...], "loss": [...], "psnr": [...], ...}}``.
 
     Returns:
-        Charts as ``{stage, metric, low, high, steps, gaussians, lines}``; a line is ``{label, raw, smooth, last}``
+        Rows of charts; a chart is ``{stage, metric, low, high, steps, lines}``, a line ``{label, raw, smooth, last}``
         with SVG path data, x to the right and y downwards in [0, 1].
     """
     stages: dict[str, dict[str, dict[str, list[float]]]] = {}
     for label, series in curves.items():
         stage, _, state = label.partition(" ")
         stages.setdefault(stage, {})[state] = series
-    return [_chart(stage, metric, lines) for metric in METRICS for stage, lines in stages.items()]
+    return [[_chart(stage, metric, lines) for stage, lines in stages.items()] for metric in METRICS if stages]
 
 
 def _chart(stage: str, metric: str, lines: dict[str, dict[str, list[float]]]) -> dict[str, Any]:
-    smooth = {label: _smooth(series[metric]) for label, series in lines.items()}
-    everything = np.concatenate([np.asarray(s[metric], float) for s in lines.values()])
+    raw = {label: np.asarray(series[metric], float) for label, series in lines.items()}
+    smooth = {label: _smooth(values) for label, values in raw.items()}
+    everything = np.concatenate(list(raw.values()))
     finite = everything[np.isfinite(everything)]
     low, high = (float(np.quantile(finite, q)) for q in (0.01, 0.99)) if len(finite) else (0.0, 1.0)
     steps = max(series["step"][-1] for series in lines.values())
@@ -47,11 +48,10 @@ def _chart(stage: str, metric: str, lines: dict[str, dict[str, list[float]]]) ->
         "low": _short(low),
         "high": _short(high),
         "steps": int(steps),
-        "gaussians": sum(int(series["gaussians"][-1]) for series in lines.values()),
         "lines": [
             {
                 "label": label,
-                "raw": path(series, np.asarray(series[metric], float)),
+                "raw": path(series, raw[label]),
                 "smooth": path(series, smooth[label]),
                 "last": _short(float(smooth[label][-1])),
             }
@@ -60,12 +60,10 @@ def _chart(stage: str, metric: str, lines: dict[str, dict[str, list[float]]]) ->
     }
 
 
-def _smooth(values: list[float]) -> np.ndarray:
+def _smooth(values: np.ndarray) -> np.ndarray:
     """Centred means over up to SMOOTH points; the window shrinks at the ends."""
-    v = np.asarray(values, float)
-    half = SMOOTH // 2
-    reach = [min(half, i, len(v) - 1 - i) for i in range(len(v))]
-    return np.array([v[i - r : i + r + 1].mean() for i, r in enumerate(reach)])
+    reach = [min(SMOOTH // 2, i, len(values) - 1 - i) for i in range(len(values))]
+    return np.array([values[i - r : i + r + 1].mean() for i, r in enumerate(reach)])
 
 
 def _short(value: float) -> str:

@@ -14,18 +14,17 @@ import jinja2
 import numpy as np
 import torch
 
-from hingesplat import __version__
 from hingesplat.errors import HingesplatError
-from hingesplat.gaussians import Gaussians
+from hingesplat.gaussians import Gaussians, posed
 from hingesplat.pictures import part_colour
-from hingesplat.report.curves import curve_figures
+from hingesplat.report.curves import chart_rows
 from hingesplat.report.spz import MAX_DEGREE, spz_bytes
 from hingesplat.twin import Joint, Twin
 
-SPLAT_BYTES = 6_000_000
+SPLAT_BYTES = 5_500_000
 """Of splats before compression, above which higher spherical harmonics are left out of the page."""
-SNAP = math.cos(math.radians(20))
-"""An up direction this close to an axis of the world is that axis."""
+EXPORTS = ("twin.xml", "twin.urdf", "model.sdf", "twin.usd")
+"""Files of ``export/``, in a folder each or not, that the page tells how to load."""
 
 
 def write_report(folder: Path) -> Path:
@@ -35,18 +34,32 @@ def write_report(folder: Path) -> Path:
     ``stages.json``, ``summary.json``, ``metrics.json`` and ``export/``, and leaves out the rest.
 
     Raises:
-        HingesplatError: no twin in the folder, or a file of it is broken.
+        HingesplatError: no twin in the folder, or a file of it is broken or of another version.
     """
     twin = Twin.load(folder / "twin.json")
     gaussians = Gaussians.load(folder / "gaussians.safetensors")
+    try:
+        page = _page(folder, twin, gaussians)
+    except (KeyError, TypeError, IndexError, jinja2.UndefinedError) as e:
+        raise HingesplatError(f"{folder}: one of its JSON files is not of this version ({e}); reconstruct again") from e
+    path = folder / "report.html"
+    tmp = path.with_name(path.name + ".tmp")
+    tmp.write_text(page, encoding="utf-8")
+    tmp.replace(path)
+    return path
+
+
+def _page(folder: Path, twin: Twin, gaussians: Gaussians) -> str:
     shown = _read(folder / "views" / "views.json") or {"up": [0, 0, 1], "held_out": False, "views": []}
     views = [_embedded(view, folder / "views") for view in shown["views"]]
     first = next((view for view in views if view["state"] == views[-1]["state"]), None)
+    config = _read(folder / "config.json") or {}
     stages = _read(folder / "stages.json") or {}
-    page = _environment().get_template("page.html").render(
-        title=Path((_read(folder / "config.json") or {}).get("capture", folder.resolve())).name,
+    bundle = gzip.compress(_resource("bundle.js").encode(), 9, mtime=0)
+    template = _environment().get_template("page.html")
+    return template.render(
+        title=Path(config.get("capture", folder.resolve())).name,
         made=datetime.fromtimestamp((folder / "twin.json").stat().st_mtime),
-        version=__version__,
         count=len(gaussians),
         twin=twin,
         unit=_unit(twin),
@@ -56,23 +69,18 @@ def write_report(folder: Path) -> Path:
         views=views,
         first=first,
         held_out=shown["held_out"],
-        charts=curve_figures(_read(folder / "curves.json") or {}),
+        charts=chart_rows(_read(folder / "curves.json") or {}),
         seconds={name: entry["seconds"] for name, entry in stages.items()},
         summary=_read(folder / "summary.json"),
         metrics=_read(folder / "metrics.json"),
-        exports={path.name for path in (folder / "export").glob("*")},
+        exports=_exports(folder),
         style=_resource("page.css"),
-        bundle=base64.b64encode(gzip.compress(_resource("bundle.js").encode(), 9, mtime=0)).decode(),
+        bundle=base64.b64encode(bundle).decode(),
     )
-    path = folder / "report.html"
-    tmp = path.with_name(path.name + ".tmp")
-    tmp.write_text(page, encoding="utf-8")
-    tmp.replace(path)
-    return path
 
 
 def scene(twin: Twin, gaussians: Gaussians, up: list[float], first: dict[str, Any] | None) -> dict[str, Any]:
-    """What the moving picture needs, moved and scaled so that the object fills a ball of radius one.
+    """What the moving picture needs, moved and scaled so that the object, its joints at their ends, fills a unit ball.
 
     Args:
         twin: its parts and joints.
@@ -81,7 +89,9 @@ def scene(twin: Twin, gaussians: Gaussians, up: list[float], first: dict[str, An
         first: the entry of ``views.json`` whose camera shows the twin at first, if there is any.
     """
     means = gaussians.means.detach().cpu().double().numpy()
-    low, high = np.quantile(means, (0.005, 0.995), axis=0) if len(means) else np.zeros((2, 3))
+    ends = [{}, {j.child: j.states[-1] for j in twin.joints}, *({j.child: v} for j in twin.joints for v in j.limits)]
+    there = [posed(gaussians, twin.transforms(values)).means.detach().cpu().numpy() for values in ends]
+    low, high = np.quantile(np.concatenate(there), (0.005, 0.995), axis=0) if len(means) else np.zeros((2, 3))
     centre, size = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-9)
     small = replace(
         gaussians.detached(),
@@ -107,12 +117,17 @@ def scene(twin: Twin, gaussians: Gaussians, up: list[float], first: dict[str, An
         }
         for joint in twin.joints
     ]
-    upward = _snapped(np.asarray(up, float))
+    view, pixel = _aside(np.asarray(up, float)), 0.0
+    if first is not None:
+        view = np.asarray(first["camera"]["position"]) - centre
+        pixel = float(np.linalg.norm(view)) / first["camera"]["focal_pixels"] / size
     return {
         "size": size,
         "unit": _unit(twin),
-        "up": upward.tolist(),
-        "from": (_aside(upward) if first is None else np.asarray(first["T_world_camera"])[:3, 3] - centre).tolist(),
+        "up": up,
+        "from": view.tolist(),
+        "outline": _outline((np.concatenate(there) - centre) / size),
+        "pixel": pixel,
         "parts": parts,
         "joints": joints,
     }
@@ -128,19 +143,19 @@ def confidence_word(joint: Joint) -> str:
     return "uncertain"
 
 
-def _snapped(up: np.ndarray) -> np.ndarray:
-    """A unit vector; the axis of the world that it nearly is, else itself."""
-    length = np.linalg.norm(up)
-    if length < 1e-6:
-        return np.array([0.0, 0.0, 1.0])
-    i = int(np.abs(up).argmax())
-    return np.eye(3)[i] * np.sign(up[i]) if abs(up[i]) > SNAP * length else up / length
-
-
 def _aside(up: np.ndarray) -> np.ndarray:
     """Somewhere to look from, a little above the ground."""
     side = np.eye(3)[int(np.abs(up).argmin())]
     return side - (side @ up) * up + 0.5 * np.cross(up, side) + 0.4 * up
+
+
+def _outline(points: np.ndarray) -> list[list[float]]:
+    """The outermost points (n, 3) in many directions, stray ones left out: what the first picture has to hold."""
+    if not len(points):
+        return [[0.0, 0.0, 0.0]]
+    along = points @ np.random.default_rng(0).normal(size=(3, 64))
+    rows = np.argsort(along, axis=0)[-1 - len(points) // 1000]
+    return points[np.unique(rows)].round(3).tolist()
 
 
 def _outward(joint: Joint, means: np.ndarray) -> list[float]:
@@ -150,6 +165,12 @@ def _outward(joint: Joint, means: np.ndarray) -> list[float]:
 
 def _unit(twin: Twin) -> str:
     return "m" if twin.units == "metres" else "units"
+
+
+def _exports(folder: Path) -> dict[str, str]:
+    """Where each of EXPORTS lies, from the run folder."""
+    found = {name: next((folder / "export").rglob(name), None) for name in EXPORTS}
+    return {name: path.relative_to(folder).as_posix() for name, path in found.items() if path is not None}
 
 
 def _css(part_id: int) -> str:

@@ -27,7 +27,7 @@ def spz_bytes(gaussians: Gaussians, *, max_degree: int = MAX_DEGREE) -> bytes:
     n, degree = len(g), min(g.sh_degree, max_degree, MAX_DEGREE)
     means = g.means.cpu().double().numpy()
     reach = max(float(np.abs(means).max(initial=0.0)), 1e-6)
-    places = int(np.clip(np.floor(22 - np.log2(reach)), 0, 24))
+    places = int(np.clip(np.floor(22 - np.log2(reach)), 0, 30))
     fixed = np.rint(means * 2.0**places).astype("<i4").reshape(-1, 1).view(np.uint8)[:, :3]
     colours = g.sh[:, 0].cpu().double().numpy() * COLOUR_SCALE * 255 + 0.5 * 255
     header = struct.pack("<IIIBBBB", MAGIC, VERSION, n, degree, places, 0, 0)
