@@ -292,7 +292,7 @@ def test_the_scene_does_not_depend_on_units_or_place(made: Path):
     for joint in twin.joints:
         unit = factor if joint.type == "prismatic" else 1.0
         data = vars(joint) | {"pivot": tuple(np.array(joint.pivot) * factor + away)}
-        joints.append(Joint(**data | {"states": tuple(s * unit for s in joint.states)}))
+        joints.append(Joint(**data | {k: tuple(v * unit for v in data[k]) for k in ("states", "limits")}))
     first["camera"]["position"] = (np.array(first["camera"]["position"]) * factor + away).tolist()
     there = scene(Twin(twin.parts, tuple(joints)), g, [0, -1, 0], first)
     assert there["size"] == pytest.approx(factor * here["size"], rel=1e-5)

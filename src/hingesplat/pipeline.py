@@ -136,7 +136,7 @@ class Curves:
             series = self.series.setdefault(label, {name: [] for name in self.NUMBERS})
             if not series["step"] or numbers["step"] > series["step"][-1]:
                 for name, values in series.items():
-                    values.append(float(f"{numbers[name]:.5g}"))
+                    values.append(round(numbers[name], 5))
 
     def save(self) -> None:
         write_json(self.path, self.series)

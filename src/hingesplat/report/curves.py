@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 METRICS = {"psnr": "PSNR, dB", "loss": "loss"}
-SMOOTH = 7
-"""Points that a line is averaged over: each step saw one photograph only, and some are harder than others."""
+SMOOTH = 3
+"""Points that a line is averaged over: each stands for a few photographs, and some are harder than others."""
 
 
 def chart_rows(curves: dict[str, dict[str, list[float]]]) -> list[list[dict[str, Any]]]:
@@ -23,7 +23,8 @@ def chart_rows(curves: dict[str, dict[str, list[float]]]) -> list[list[dict[str,
     stages: dict[str, dict[str, dict[str, list[float]]]] = {}
     for label, series in curves.items():
         stage, _, state = label.partition(" ")
-        stages.setdefault(stage, {})[state] = series
+        begun = slice(1 if len(series["step"]) > 2 else 0, None)  # The first point is one photograph's alone.
+        stages.setdefault(stage, {})[state] = {name: values[begun] for name, values in series.items()}
     return [[_chart(stage, metric, lines) for stage, lines in stages.items()] for metric in METRICS if stages]
 
 
