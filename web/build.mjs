@@ -18,7 +18,6 @@ await build({
   target: "es2022",
   charset: "ascii",
   legalComments: "none",
-  define: { "import.meta.url": '"about:blank"' },
   banner: { js: `/*\n${notices.join("\n\n---\n\n").replaceAll("*/", "* /")}\n*/` },
 });
 

@@ -26,7 +26,7 @@ function show(child, value) {
   slider.nextElementSibling.textContent = words(joint, value);
 }
 
-function values_at(slider) {
+function valueAt(slider) {
   const [low, high] = joints.get(Number(slider.dataset.part)).limits;
   return low + (slider.value / slider.max) * (high - low);
 }
@@ -75,7 +75,7 @@ async function start() {
   for (const slider of sliders) {
     slider.addEventListener("input", () => {
       play(false);
-      show(Number(slider.dataset.part), values_at(slider));
+      show(Number(slider.dataset.part), valueAt(slider));
       scene.pose(values);
     });
   }

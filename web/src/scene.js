@@ -14,7 +14,7 @@ function decoded(base64) {
 }
 
 // The motion of a joint at a value, as Joint.transform of the Python package has it.
-export function motion(joint, value) {
+function motion(joint, value) {
   const T = new THREE.Matrix4();
   const axis = new THREE.Vector3(...joint.axis);
   if (joint.type === "prismatic") return T.setPosition(axis.multiplyScalar(value));
@@ -64,7 +64,7 @@ export async function openScene(stage, twin) {
   }
 
   const parts = new Map();
-  for (const part of twin.parts) {
+  for (const part of twin.parts.filter(({ spz }) => spz)) {
     const group = new THREE.Group();
     group.matrixAutoUpdate = false;
     scene.add(group);
@@ -75,7 +75,7 @@ export async function openScene(stage, twin) {
   }
   const joints = new Map(twin.joints.map((joint) => [joint.child, joint]));
   for (const joint of twin.joints) {
-    if (joint.type === "fixed") continue;
+    if (joint.type === "fixed" || !parts.has(joint.child)) continue;
     const axis = axisOf(joint, twin.parts.find((p) => p.id === joint.child).colour, twin.size);
     axis.visible = false;
     scene.add(axis);
@@ -142,6 +142,7 @@ export async function openScene(stage, twin) {
     want();
   });
 
+  let untouched = true;
   // From the side that the photograph shows, as near as the outline of the twin with its joints at their ends allows.
   function resetView() {
     const from = new THREE.Vector3(...twin.from).normalize();
@@ -158,13 +159,13 @@ export async function openScene(stage, twin) {
     const slope = Math.tan((FOV / 2) * (Math.PI / 180)) / MARGIN;
     const [x, wide] = fit("x", slope * camera.aspect);
     const [y, high] = fit("y", slope);
+    untouched = true;
     controls.target.set(x, y, 0).applyQuaternion(camera.quaternion);
     camera.position.copy(controls.target).addScaledVector(from, Math.max(wide, high, 1));
     controls.update();
     want();
   }
 
-  let untouched = true;
   controls.addEventListener("start", () => (untouched = false));
   new ResizeObserver(() => {
     const { clientWidth, clientHeight } = stage;

@@ -101,14 +101,11 @@ def scene(twin: Twin, gaussians: Gaussians, up: list[float], first: dict[str, An
     degree = MAX_DEGREE
     while degree > 0 and len(gaussians) * (14 + 3 * (degree + 1) ** 2) > SPLAT_BYTES:
         degree -= 1
-    parts = [
-        {
-            "id": part.id,
-            "colour": _css(part.id),
-            "spz": base64.b64encode(spz_bytes(small[small.part == part.id], max_degree=degree)).decode(),
-        }
-        for part in twin.parts
-    ]
+    parts = []
+    for part in twin.parts:
+        own = small[small.part == part.id]
+        spz = base64.b64encode(spz_bytes(own, max_degree=degree)).decode() if len(own) else None
+        parts.append({"id": part.id, "colour": _css(part.id), "spz": spz})
     joints = [
         {
             **{name: getattr(joint, name) for name in ("child", "parent", "type", "axis", "states", "limits")},
