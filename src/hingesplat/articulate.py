@@ -14,13 +14,12 @@ from hingesplat.gaussians import Gaussians
 from hingesplat.losses.articulation import articulation_loss
 from hingesplat.losses.contact import contact_loss
 from hingesplat.losses.part import nearest_neighbours, part_loss, part_probabilities, soft_motion
-from hingesplat.losses.photometric import psnr
 from hingesplat.losses.repel import repel_force, sample_repel_points
 from hingesplat.losses.vector_field import vector_loss
 from hingesplat.losses.velocity import fit_parts, velocity_loss
 from hingesplat.optim import GaussianAdam, LearningRates
 from hingesplat.poses import PoseDelta, StateLossConfig, move, part_centres, state_loss
-from hingesplat.training import Report, grow, shuffled, training_view
+from hingesplat.training import Report, averaged, grow, shuffled, training_view
 
 
 @dataclass(frozen=True)
@@ -119,6 +118,7 @@ def articulate(
     photographs = shuffled(training, rng)
     statistics = torch.zeros((len(optimiser), 3))
     targets: list[_Targets] = []
+    tell = averaged(report, config.steps)
     for step in range(config.steps):
         progress = step / config.steps
         state, view = next(photographs)
@@ -145,14 +145,7 @@ def articulate(
             statistics = torch.zeros((len(optimiser), 3))
             identity.stale()
             targets = []  # Rows have changed places.
-        if step % 50 == 0 or step == config.steps - 1:
-            report(
-                step=step + 1,
-                steps=config.steps,
-                loss=float(loss.detach()),
-                psnr=float(psnr(image.detach()[:3], view.image[:3])),
-                gaussians=len(optimiser),
-            )
+        tell(loss, image, view, len(optimiser))
     return _result(optimiser, poses)
 
 

@@ -68,50 +68,114 @@ class Reconstruct:
 
 
 @dataclass(frozen=True)
-class Demo:
-    """Make a cabinet of a door and a drawer, photograph it, rebuild it as a twin, and measure the twin."""
+class View:
+    """Look at a run (splats, meshes, joints on sliders, photographs) or a capture (cameras, hulls) in the browser."""
 
-    out: Path = Path("demo")
-    """Gets capture/, made once, and run/, made anew each time."""
+    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN|CAPTURE")]
+    """A run folder or a capture."""
+    host: str = "127.0.0.1"
+    """Address to listen on; 0.0.0.0 lets other machines in."""
+    port: int = 8080
+    """Port to listen on."""
     quiet: bool = False
     """Say nothing but warnings and errors."""
 
-    @property
-    def log_folder(self) -> Path:
-        return self.out / "run"
+    def run(self, console: Console) -> None:
+        from hingesplat.viewer import open_viewer
+
+        with open_viewer(self.folder, host=self.host, port=self.port) as viewer:
+            console.print(f"{viewer.url} shows {escape(str(self.folder))}; Ctrl-C ends it", soft_wrap=True)
+            with suppress(KeyboardInterrupt):
+                threading.Event().wait()
+
+
+@dataclass(frozen=True)
+class Render:
+    """Film a run's twin, drawn from its splats: around it, its joints moving, or one after the other."""
+
+    run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """A run folder."""
+    out: Path
+    """The film: .mp4 or .gif."""
+    what: Literal["orbit", "sweep", "both"] = "both"
+    """Once around it; the joints through their range and back; both, one after the other."""
+    size: int = 720
+    """Width and height, pixels."""
+    fps: float = 30
+    """Pictures a second."""
+    seconds: float = 8
+    """Of the whole film, which loops."""
+    quiet: bool = False
+    """Say nothing but warnings and errors."""
 
     def run(self, console: Console) -> None:
-        from hingesplat.capture import load_capture
-        from hingesplat.export.check import simulation
-        from hingesplat.metrics import evaluate
+        from hingesplat.pipeline import load_result, up_of
+        from hingesplat.video import write_video
 
-        started = time.perf_counter()
-        capture, run = self.out / "capture", self.out / "run"
-        if not (capture / "truth" / "meta.json").is_file():
-            Synth("cabinet", capture, size=200, views=60, test_views=10, below=0.125).run(console)
-        twin = _reconstruct(load_capture(capture), demo_config(), run, True, console)
-        show_joints(console, twin)
-        show_metrics(console, evaluate(run, capture / "truth", simulation(run / "export")))
-        show_paths(console, run)
-        console.print(f"{time.perf_counter() - started:.0f} s in all")
+        gaussians, twin = load_result(self.run_folder)
+        with StageProgress(console) as report:
+            write_video(
+                self.out,
+                gaussians,
+                twin,
+                what=self.what,
+                up=up_of(self.run_folder),
+                size=self.size,
+                fps=self.fps,
+                seconds=self.seconds,
+                report=report,
+            )
+        console.print(f"written: {escape(str(self.out))}", soft_wrap=True)
 
 
-def demo_config() -> "ReconstructConfig":
-    """The standard preset cut to the demo's 200 pixels."""
-    from hingesplat.pipeline import ReconstructConfig
+@dataclass(frozen=True)
+class Report:
+    """Write RUN/report.html anew: the twin with sliders, joints, pictures, curves, in one file for any browser."""
 
-    config = ReconstructConfig()
-    return replace(
-        config,
-        fit=replace(config.fit, steps=1200, start_gaussians=3000, max_gaussians=8000),
-        articulate=replace(config.articulate, steps=1500, max_gaussians=16_000),
-        mesh=replace(config.mesh, views=32, image_size=200),
-    )
+    run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """A run folder."""
+    quiet: bool = False
+    """Say nothing but warnings and errors."""
+
+    def run(self, console: Console) -> None:
+        from hingesplat.report import write_report
+
+        console.print(f"written: {escape(str(write_report(self.run_folder)))}", soft_wrap=True)
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a run's twin for simulators and splat viewers, each format into a folder that can be moved."""
+
+    run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """A run folder."""
+    format: Annotated[tuple[str, ...], tyro.conf.arg(metavar=f"{{{','.join(FORMATS)}}} ...")] = ("urdf", "mjcf")
+    """One or more; OUT/FORMAT is what is written."""
+    out: Path | None = None
+    """Folder to write to; RUN/export if none is given."""
+    options: Annotated[ExportConfig, tyro.conf.arg(name="")] = field(default_factory=ExportConfig)
+    check: bool = True
+    """Whether what was written is loaded in the simulators installed, and each joint driven end to end."""
+    quiet: bool = False
+    """Say nothing but warnings and errors."""
+
+    def run(self, console: Console) -> None:
+        from hingesplat.export.check import check_export
+        from hingesplat.pipeline import load_meshes, load_result
+
+        gaussians, twin = load_result(self.run_folder)
+        meshes = load_meshes(self.run_folder, twin)
+        home = self.run_folder / "export"
+        paths = export_twin(twin, meshes, gaussians, self.out or home, self.format, self.options, cache=home / ".hulls")
+        for form, path in paths.items():
+            console.print(f"written: {escape(str(path))}", soft_wrap=True)
+            for check in check_export(form, path) if self.check else ():
+                show_check(console, form, check)
 
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Compare a run with the truth; every number goes to RUN/metrics.json."""
+    """Compare a run with the truth; every number goes to RUN/metrics.json, and into RUN/report.html."""
 
     run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """A run folder."""
@@ -123,8 +187,10 @@ class Evaluate:
     def run(self, console: Console) -> None:
         from hingesplat.export.check import simulation
         from hingesplat.metrics import evaluate
+        from hingesplat.report import write_report
 
         show_metrics(console, evaluate(self.run_folder, self.truth, simulation(self.run_folder / "export")))
+        write_report(self.run_folder)
         console.print(f"written: {escape(str(self.run_folder / 'metrics.json'))}", soft_wrap=True)
 
 
@@ -171,97 +237,50 @@ class Synth:
 
 
 @dataclass(frozen=True)
-class Export:
-    """Write a run's twin for simulators and splat viewers, each format into a folder that can be moved."""
+class Demo:
+    """Make a cabinet of a door and a drawer, photograph it, rebuild it as a twin, and measure the twin."""
 
-    run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-    """A run folder."""
-    format: Annotated[tuple[str, ...], tyro.conf.arg(metavar=f"{{{','.join(FORMATS)}}} ...")] = ("urdf", "mjcf")
-    """One or more; OUT/FORMAT is what is written."""
-    out: Path | None = None
-    """Folder to write to; RUN/export if none is given."""
-    options: Annotated[ExportConfig, tyro.conf.arg(name="")] = field(default_factory=ExportConfig)
-    check: bool = True
-    """Whether what was written is loaded in the simulators installed, and each joint driven end to end."""
+    out: Path = Path("demo")
+    """Gets capture/, made once, and run/, made anew each time."""
     quiet: bool = False
     """Say nothing but warnings and errors."""
 
-    def run(self, console: Console) -> None:
-        from hingesplat.export.check import check_export
-        from hingesplat.pipeline import load_meshes, load_result
-
-        gaussians, twin = load_result(self.run_folder)
-        meshes = load_meshes(self.run_folder, twin)
-        home = self.run_folder / "export"
-        paths = export_twin(twin, meshes, gaussians, self.out or home, self.format, self.options, cache=home / ".hulls")
-        for form, path in paths.items():
-            console.print(f"written: {escape(str(path))}", soft_wrap=True)
-            for check in check_export(form, path) if self.check else ():
-                show_check(console, form, check)
-
-
-@dataclass(frozen=True)
-class Render:
-    """Film a run's twin, drawn from its splats: around it, its joints moving, or one after the other."""
-
-    run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-    """A run folder."""
-    out: Path
-    """The film: .mp4 or .gif."""
-    what: Literal["orbit", "sweep", "both"] = "both"
-    """Once around it; the joints through their range and back; both, one after the other."""
-    size: int = 720
-    """Width and height, pixels."""
-    fps: float = 30
-    """Pictures a second."""
-    seconds: float = 8
-    """Of the whole film, which loops."""
-    quiet: bool = False
-    """Say nothing but warnings and errors."""
+    @property
+    def log_folder(self) -> Path:
+        return self.out / "run"
 
     def run(self, console: Console) -> None:
-        from hingesplat.pipeline import load_result, up_of
-        from hingesplat.video import write_video
+        from hingesplat.capture import load_capture
+        from hingesplat.export.check import simulation
+        from hingesplat.metrics import evaluate
+        from hingesplat.report import write_report
 
-        gaussians, twin = load_result(self.run_folder)
-        with StageProgress(console) as report:
-            write_video(
-                self.out,
-                gaussians,
-                twin,
-                what=self.what,
-                up=up_of(self.run_folder),
-                size=self.size,
-                fps=self.fps,
-                seconds=self.seconds,
-                report=report,
-            )
-        console.print(f"written: {escape(str(self.out))}", soft_wrap=True)
+        started = time.perf_counter()
+        capture, run = self.out / "capture", self.out / "run"
+        if not (capture / "truth" / "meta.json").is_file():
+            Synth("cabinet", capture, size=200, views=60, test_views=10, below=0.125).run(console)
+        twin = _reconstruct(load_capture(capture), demo_config(), run, True, console)
+        show_joints(console, twin)
+        show_metrics(console, evaluate(run, capture / "truth", simulation(run / "export")))
+        write_report(run)
+        show_paths(console, run)
+        console.print(f"{time.perf_counter() - started:.0f} s in all")
 
 
-@dataclass(frozen=True)
-class View:
-    """Look at a run (splats, meshes, joints on sliders, photographs) or a capture (cameras, hulls) in the browser."""
+def demo_config() -> "ReconstructConfig":
+    """The standard preset cut to the demo's 200 pixels."""
+    from hingesplat.pipeline import ReconstructConfig
 
-    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN|CAPTURE")]
-    """A run folder or a capture."""
-    host: str = "127.0.0.1"
-    """Address to listen on; 0.0.0.0 lets other machines in."""
-    port: int = 8080
-    """Port to listen on."""
-    quiet: bool = False
-    """Say nothing but warnings and errors."""
-
-    def run(self, console: Console) -> None:
-        from hingesplat.viewer import open_viewer
-
-        with open_viewer(self.folder, host=self.host, port=self.port) as viewer:
-            console.print(f"{viewer.url} shows {escape(str(self.folder))}; Ctrl-C ends it", soft_wrap=True)
-            with suppress(KeyboardInterrupt):
-                threading.Event().wait()
+    config = ReconstructConfig()
+    return replace(
+        config,
+        fit=replace(config.fit, steps=1200, start_gaussians=3000, max_gaussians=8000),
+        articulate=replace(config.articulate, steps=1500, max_gaussians=16_000),
+        mesh=replace(config.mesh, views=32, image_size=200),
+    )
 
 
-Command = Reconstruct | Demo | Evaluate | Synth | Export | View | Render
+Command = Reconstruct | View | Render | Report | Export | Evaluate | Synth | Demo
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -471,6 +490,7 @@ def show_paths(console: Console, run: Path) -> None:
     """What a run wrote and what it is for."""
     table = Table.grid(padding=(0, 2))
     for name, what in {
+        "report.html": "the twin in a browser",
         "twin.json": "parts and joints",
         "parts": "splats and meshes",
         "export/urdf/twin.urdf": "for robotics",

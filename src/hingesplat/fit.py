@@ -12,12 +12,13 @@ from torch import Tensor
 
 from hingesplat.capture import View, visual_hull
 from hingesplat.gaussians import Gaussians
-from hingesplat.losses.photometric import photometric, psnr
+from hingesplat.losses.photometric import photometric
 from hingesplat.optim import GaussianAdam, LearningRates, morton_order
 from hingesplat.render import render
 from hingesplat.training import (
     Report,
     TrainingView,
+    averaged,
     depth_and_its_square,
     depth_variance,
     four_planes,
@@ -136,6 +137,7 @@ def _optimise(
     cameras = [v.camera for v in training]
     statistics = torch.zeros((len(optimiser), 3))
     photographs = shuffled([training], rng)
+    tell = averaged(report, config.steps)
     for step in range(config.steps):
         progress = step / config.steps
         _, view = next(photographs)
@@ -149,14 +151,7 @@ def _optimise(
         if growing and step % 500 == 0:
             optimiser.select(seen_weight(optimiser.gaussians.detached(), cameras) > 0.5)
             statistics = torch.zeros((len(optimiser), 3))
-        if step % 50 == 0 or step == config.steps - 1:
-            report(
-                step=step + 1,
-                steps=config.steps,
-                loss=float(loss.detach()),
-                psnr=float(psnr(image.detach()[:3], view.image[:3])),
-                gaussians=len(optimiser),
-            )
+        tell(loss, image, view, len(optimiser))
 
 
 def _view_loss(

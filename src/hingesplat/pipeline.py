@@ -40,6 +40,7 @@ from hingesplat.gaussians import Gaussians, posed
 from hingesplat.joints import JointsConfig, find_joints
 from hingesplat.mesh import MeshConfig, mesh_parts
 from hingesplat.pictures import movable_share, write_motion_gif, write_summary
+from hingesplat.report import spread_views, write_report, write_views
 from hingesplat.search import Motion
 from hingesplat.segment import Segmentation, SegmentConfig, segment, track
 from hingesplat.twin import Joint, Part, Twin
@@ -53,10 +54,12 @@ MAX_UNEXPLAINED = 0.8
 """Share of what moved that no rigid part explains, above which there is no point in going on."""
 NOISE = 10
 """Seeds, in those of the smallest part, below which nothing need have moved: one state photographed twice had 167."""
+SHOWN_VIEWS = 3
+"""Photographs of each state that the report shows beside the twin."""
 ARTEFACTS = (
-    *("config.json", "stages.json", "log.txt", "fit_state*.safetensors", "segmentation.*"),
+    *("config.json", "stages.json", "curves.json", "log.txt", "fit_state*.safetensors", "segmentation.*"),
     *("canonical.safetensors", "articulation.safetensors", "gaussians*.safetensors", "twin.json"),
-    *("parts", "export", "motion.gif", "summary.*", "metrics.json", "*.tmp"),
+    *("parts", "export", "views", "motion.gif", "summary.*", "metrics.json", "report.html", "*.tmp"),
 )
 """Everything that a run folder holds; ``overwrite`` deletes these and nothing else."""
 
@@ -113,6 +116,31 @@ def preset(name: PresetName) -> ReconstructConfig:
     raise HingesplatError(f"preset: unknown {name!r}; use fast, standard or paper")
 
 
+class Curves:
+    """What the stages report on their way, kept as ``{stage or "stage state t": {number: [...]}}``."""
+
+    NUMBERS = ("step", "loss", "psnr", "gaussians")
+
+    def __init__(self, path: Path, report: Report) -> None:
+        self.path, self.pass_on = path, report
+        self.series: dict[str, dict[str, list[float]]] = _read_json(path) if path.is_file() else {}
+
+    def report(self, *, stage: str, state: int | None = None, **numbers: Any) -> None:
+        """Pass on, and take down every step that goes further than the last."""
+        self.pass_on(stage=stage, **({} if state is None else {"state": state}), **numbers)
+        if not numbers:  # The stage begins.
+            self.series = {label: s for label, s in self.series.items() if label.split()[0] != stage}
+        elif all(name in numbers for name in self.NUMBERS):
+            label = stage if state is None else f"{stage} state {state}"
+            series = self.series.setdefault(label, {name: [] for name in self.NUMBERS})
+            if not series["step"] or numbers["step"] > series["step"][-1]:
+                for name, values in series.items():
+                    values.append(round(numbers[name], 5))
+
+    def save(self) -> None:
+        write_json(self.path, self.series)
+
+
 @dataclass(frozen=True)
 class Run:
     """What every stage sees: photographs, what to do with them, and the folder that stages talk through."""
@@ -165,18 +193,19 @@ def reconstruct(
     capture = _capped(capture, config.max_size)
     folder = Path(tempfile.mkdtemp(prefix="hingesplat-")) if out is None else Path(out)
     _open(folder, capture, config, overwrite)
-    run = Run(folder, capture, config, report)
+    curves = Curves(folder / "curves.json", report)
+    run = Run(folder, capture, config, curves.report)
     try:
         with _log_file(folder / "log.txt"), _repeatable():
             log.info("%s to %s", capture.path, folder)
-            _run_stages(run)
+            _run_stages(run, curves)
     finally:
         for leftover in folder.glob("**/*.tmp"):
             shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink(missing_ok=True)
     return Twin.load(run / "twin.json")
 
 
-def _run_stages(run: Run) -> None:
+def _run_stages(run: Run, curves: Curves) -> None:
     finished = _read_json(run / "stages.json") if (run / "stages.json").is_file() else {}
     for name, stage in STAGES.items():
         if name in finished:
@@ -187,10 +216,12 @@ def _run_stages(run: Run) -> None:
         stage(run)
         seconds = time.perf_counter() - started
         finished[name] = {"seconds": round(seconds, 2), "peak_memory_mb": peak_memory_mb()}
+        curves.save()
         write_json(run / "stages.json", finished)
         run.report(stage=name, seconds=seconds)
         log.info("%s: %.1f s", name, seconds)
     _write_summary(run, finished)
+    write_report(run.folder)
 
 
 # The stages, each a function of the run that reads files and writes files.
@@ -319,6 +350,21 @@ def _pictures(run: Run) -> None:
     best = [telling_view(posed(gaussians, T), views) for T, views in zip(poses, run.views, strict=True)]
     write_summary(run / "summary.png", gaussians, list(zip(best, poses, strict=True)))
     write_motion_gif(run / "motion.gif", gaussians, twin, best[-1].camera)
+    _show_views(run)
+
+
+def _show_views(run: Run) -> None:
+    """Photographs for the report: those held back from the reconstruction if every state has some."""
+    states = run.capture.states
+    held_out = all(state.test for state in states)
+    shown = []
+    for t, state in enumerate(states):
+        views = state.test if held_out else state.train
+        gaussians = Gaussians.load(run / f"gaussians_state{t}.safetensors")
+        shown.append((spread_views(views, telling_view(gaussians, views), SHOWN_VIEWS), gaussians))
+    up = common_up([view.camera for views in run.views for view in views])
+    with whole_folder(run / "views") as folder:
+        write_views(folder, shown, up, held_out=held_out)
 
 
 STAGES: dict[str, Callable[[Run], None]] = {
