@@ -1,17 +1,34 @@
 """Files and folders that are written whole or not at all."""
 
+import json
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A path to write to that takes the place of ``path`` when all went well, and is gone when not."""
+    tmp = path.with_name(path.name + ".tmp")
+    try:
+        yield tmp
+        tmp.replace(path)
+    finally:
+        tmp.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> Path:
     """Write a UTF-8 file, whole or not at all; returns its path."""
-    tmp = path.with_name(path.name + ".tmp")
-    tmp.write_text(text, encoding="utf-8")
-    tmp.replace(path)
+    with whole_file(path) as tmp:
+        tmp.write_text(text, encoding="utf-8")
     return path
+
+
+def write_json(path: Path, data: Any) -> Path:
+    """Write a JSON file, whole or not at all; returns its path."""
+    return write_text(path, json.dumps(data, indent=1))
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 import colorsys
 import io
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from hingesplat.camera import Camera
 from hingesplat.capture.types import View
+from hingesplat.files import whole_file
 from hingesplat.gaussians import SH_C0, Gaussians, posed
 from hingesplat.render import render
 from hingesplat.twin import Joint, Twin
@@ -60,7 +61,8 @@ def write_summary(
         camera = fitted(view.camera, size)
         scene = posed(gaussians.detached(), poses)
         rows.append([photograph(view, camera), picture(scene, camera), picture(in_part_colours(scene), camera)])
-    _save(path, lambda file: _grid(rows, ("photograph", "twin", "parts")).save(file, "PNG"))
+    with whole_file(path) as tmp:
+        _grid(rows, ("photograph", "twin", "parts")).save(tmp, "PNG")
 
 
 def write_motion_gif(
@@ -94,7 +96,8 @@ def write_motion_gif(
         smaller = tuple(int(0.85 * s) for s in pictures[0].size)
         pictures = [p.resize((smaller[0], smaller[1]), Image.Resampling.LANCZOS) for p in pictures]
         data = encode_gif(pictures)
-    _save(path, lambda file: file.write(data))
+    with whole_file(path) as tmp:
+        tmp.write_bytes(data)
 
 
 def sweep_values(joints: Sequence[Joint], time: float) -> dict[int, float]:
@@ -186,10 +189,3 @@ def encode_gif(pictures: Sequence[Image.Image], fps: float = 20) -> bytes:
         file, "GIF", save_all=True, append_images=indexed[1:], duration=lengths.tolist(), loop=0, disposal=1
     )
     return file.getvalue()
-
-
-def _save(path: Path, write: Callable[[io.BufferedWriter], object]) -> None:
-    tmp = path.with_name(path.name + ".tmp")
-    with tmp.open("wb") as file:
-        write(file)
-    tmp.replace(path)

@@ -33,7 +33,7 @@ from hingesplat.capture.images import downsampled
 from hingesplat.errors import HingesplatError
 from hingesplat.export import export_twin
 from hingesplat.export.splats import write_ply
-from hingesplat.files import whole_folder
+from hingesplat.files import whole_file, whole_folder, write_json
 from hingesplat.fit import FitConfig, fit
 from hingesplat.fuse import FuseConfig, fuse
 from hingesplat.gaussians import Gaussians, posed
@@ -612,18 +612,10 @@ def peak_memory_mb() -> float | None:
     return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)
 
 
-def write_json(path: Path, data: dict[str, Any]) -> None:
-    """Write a JSON file, whole or not at all."""
-    tmp = path.with_name(path.name + ".tmp")
-    tmp.write_text(json.dumps(data, indent=1))
-    tmp.replace(path)
-
-
 def write_tensors(path: Path, tensors: dict[str, Tensor]) -> None:
     """Write a safetensors file, whole or not at all."""
-    tmp = path.with_name(path.name + ".tmp")
-    save_file({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, str(tmp))
-    tmp.replace(path)
+    with whole_file(path) as tmp:
+        save_file({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, str(tmp))
 
 
 def _read_json(path: Path) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from PIL import Image
 
 from hingesplat.camera import Camera, look_at
 from hingesplat.errors import HingesplatError
+from hingesplat.files import whole_file
 from hingesplat.gaussians import Gaussians, posed
 from hingesplat.pictures import encode_gif, movable_share, sweep_values
 from hingesplat.render import render
@@ -82,15 +83,11 @@ def write_video(
             report(stage="render", step=i + 1, steps=frames)
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    tmp = path.with_name(path.name + ".tmp")
-    try:
+    with whole_file(path) as tmp:
         if path.suffix == ".gif":
             tmp.write_bytes(encode_gif([Image.fromarray(frame) for frame in draw()], fps))
         else:
             _write_mp4(tmp, draw(), size, fps)
-        tmp.replace(path)
-    finally:
-        tmp.unlink(missing_ok=True)
 
 
 def _check(path: Path, size: int, fps: float, seconds: float) -> int:

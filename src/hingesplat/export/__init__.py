@@ -1,6 +1,5 @@
 """Writers: a ``Twin`` in, files out."""
 
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import hingesplat
 from hingesplat.errors import HingesplatError
-from hingesplat.files import whole_folder, write_text
+from hingesplat.files import whole_folder, write_json
 
 if TYPE_CHECKING:
     import trimesh
@@ -107,7 +106,7 @@ def export_twin(
                     names = {link.part.id: link.name for link in links}
                     T_mesh_file = write_splats(placed, names, folder, form).tolist()
                     path = folder / f"twin.{form}"
-            write_text(folder / NOTE, json.dumps({"format": form, **note, "T_mesh_file": T_mesh_file}, indent=1))
+            write_json(folder / NOTE, {"format": form, **note, "T_mesh_file": T_mesh_file})
         written[form] = out / form / path.name
     return written
 

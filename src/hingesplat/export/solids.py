@@ -13,6 +13,8 @@ import trimesh
 from scipy.spatial import KDTree, QhullError
 from trimesh.visual import ColorVisuals, TextureVisuals
 
+from hingesplat.files import whole_file
+
 COARSE = 0.015
 """Of a mesh's size: what may be shaved off where only the rough shape counts."""
 
@@ -97,9 +99,8 @@ def collision_hulls(mesh: trimesh.Trimesh, cache: Path, *, most: int = 12) -> tu
     hulls = hulls or [mesh.convex_hull]
     with suppress(OSError):  # A folder that cannot be written costs only time.
         cache.mkdir(parents=True, exist_ok=True)
-        tmp = file.with_name(file.stem + ".tmp.npz")
-        np.savez(tmp, **{f"{i:03d}": h.vertices for i, h in enumerate(hulls)})
-        tmp.replace(file)
+        with whole_file(file) as tmp, tmp.open("wb") as opened:  # Given a name, savez would add a suffix.
+            np.savez(opened, **{f"{i:03d}": h.vertices for i, h in enumerate(hulls)})
     return tuple(hulls)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from hingesplat.errors import HingesplatError
+from hingesplat.files import whole_file
 from hingesplat.gaussians import Gaussians
 from hingesplat.render import sh_basis
 from hingesplat.se3 import matrix_to_wxyz, quat_multiply
@@ -106,9 +107,8 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
     table = torch.cat([c.cpu().float() for c in columns], 1).numpy().astype("<f4")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
     header += [f"property float {name}" for name in _names(rest.shape[1])]
-    tmp = path.with_name(path.name + ".tmp")
-    tmp.write_bytes(("\n".join([*header, "end_header"]) + "\n").encode() + table.tobytes())
-    tmp.replace(path)
+    with whole_file(path) as tmp:
+        tmp.write_bytes(("\n".join([*header, "end_header"]) + "\n").encode() + table.tobytes())
 
 
 def read_ply(path: Path) -> Gaussians:

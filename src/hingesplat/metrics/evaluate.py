@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 
 from hingesplat.errors import HingesplatError
+from hingesplat.files import write_text
 from hingesplat.metrics.motion import joint_errors
 from hingesplat.metrics.surface import SAMPLES, chamfer, clean, match, overlap, penetration, sample
 from hingesplat.metrics.truth import Truth, load_mesh, load_truth
@@ -72,9 +73,7 @@ def evaluate(run: Path, truth: Path, simulation: Mapping[str, Any] = NO_SIMULATI
         "mesh_cleaning": "components below 10 % of the largest one's area dropped",
         "truth": str(truth),
     }
-    tmp = run / "metrics.json.tmp"
-    tmp.write_text(json.dumps(metrics, indent=1, allow_nan=False))
-    tmp.replace(run / "metrics.json")
+    write_text(run / "metrics.json", json.dumps(metrics, indent=1, allow_nan=False))
     return metrics
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from hingesplat.errors import HingesplatError
+from hingesplat.files import write_text
 from hingesplat.gaussians import Gaussians, posed
 from hingesplat.pictures import part_colour
 from hingesplat.report.curves import chart_rows
@@ -23,8 +24,8 @@ from hingesplat.twin import Joint, Twin
 
 SPLAT_BYTES = 5_500_000
 """Of splats before compression, above which higher spherical harmonics are left out of the page."""
-EXPORTS = ("twin.xml", "twin.urdf", "model.sdf", "twin.usd")
-"""Files of ``export/``, in a folder each or not, that the page tells how to load."""
+EXPORTS = ("export/mjcf/twin.xml", "export/urdf/twin.urdf", "export/sdf/model.sdf", "export/usd/twin.usd")
+"""Files that the page tells how to load."""
 
 
 def write_report(folder: Path) -> Path:
@@ -42,11 +43,7 @@ def write_report(folder: Path) -> Path:
         page = _page(folder, twin, gaussians)
     except (KeyError, TypeError, IndexError, jinja2.UndefinedError) as e:
         raise HingesplatError(f"{folder}: one of its JSON files is not of this version ({e}); reconstruct again") from e
-    path = folder / "report.html"
-    tmp = path.with_name(path.name + ".tmp")
-    tmp.write_text(page, encoding="utf-8")
-    tmp.replace(path)
-    return path
+    return write_text(folder / "report.html", page)
 
 
 def _page(folder: Path, twin: Twin, gaussians: Gaussians) -> str:
@@ -73,7 +70,7 @@ def _page(folder: Path, twin: Twin, gaussians: Gaussians) -> str:
         seconds={name: entry["seconds"] for name, entry in stages.items()},
         summary=_read(folder / "summary.json"),
         metrics=_read(folder / "metrics.json"),
-        exports=_exports(folder),
+        exports=[path for path in EXPORTS if (folder / path).is_file()],
         style=_resource("page.css"),
         bundle=base64.b64encode(bundle).decode(),
     )
@@ -162,12 +159,6 @@ def _outward(joint: Joint, means: np.ndarray) -> list[float]:
 
 def _unit(twin: Twin) -> str:
     return "m" if twin.units == "metres" else "units"
-
-
-def _exports(folder: Path) -> dict[str, str]:
-    """Where each of EXPORTS lies, from the run folder."""
-    found = {name: next((folder / "export").rglob(name), None) for name in EXPORTS}
-    return {name: path.relative_to(folder).as_posix() for name, path in found.items() if path is not None}
 
 
 def _css(part_id: int) -> str:

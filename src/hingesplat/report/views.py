@@ -1,6 +1,5 @@
 """``views/``: some photographs of a run and the twin from their cameras, kept for the page."""
 
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +10,7 @@ from PIL import Image
 
 from hingesplat.camera import Camera
 from hingesplat.capture.types import View
+from hingesplat.files import write_json
 from hingesplat.gaussians import Gaussians
 from hingesplat.render import render
 
@@ -67,7 +67,7 @@ def write_views(
                 }
             )
     index = {"up": np.asarray(up).tolist(), "held_out": held_out, "views": entries}
-    (folder / "views.json").write_text(json.dumps(index, indent=1))
+    write_json(folder / "views.json", index)
 
 
 @torch.no_grad()

@@ -1,7 +1,5 @@
 """Writes a made object as a capture, with its truth beside it."""
 
-import json
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +11,7 @@ from PIL import Image
 from hingesplat.camera import Camera, look_at
 from hingesplat.capture import View, write_state
 from hingesplat.errors import HingesplatError
+from hingesplat.files import whole_folder, write_json
 from hingesplat.synth.model import Model
 from hingesplat.synth.objects import CAMERAS, NAMES, build
 from hingesplat.synth.shapes import solid_mesh
@@ -61,38 +60,31 @@ def make(
     model = build(name, seed)
     centre, scale, radius = unit_box(model, states)
     distance = 1.02 * radius / np.sin(FIELD_OF_VIEW / 2)  # The object fills the picture.
-    out.parent.mkdir(parents=True, exist_ok=True)
-    tmp = out.with_name(out.name + ".tmp")
-    shutil.rmtree(tmp, ignore_errors=True)
     try:
-        surface = Surface(model, fine_texel(model, size, scale))
-        rng = np.random.default_rng((CAMERAS, seed))
-        total, done = states * (train_views + test_views), 0
-        for state in range(states):
-            scene = LitScene(surface, model.state(state))
-            ids = tmp / "truth" / f"partid_state{state}"
-            ids.mkdir(parents=True)
-            for split, count in (("train", train_views), ("test", test_views)):
-                views = []
-                for i, camera in enumerate(cameras_around(rng, count, size, distance, below)):
-                    # The scene stays in metres; the camera goes to it.
-                    T = camera.T_world_camera.copy()
-                    T[:3, 3] = T[:3, 3] / scale + centre
-                    rgba, depth, parts = scene.photograph(replace(camera, T_world_camera=T))
-                    views.append(View(camera, rgba, f"state_{state}/{split}/{i:03d}.png", depth * scale))
-                    Image.fromarray(parts).save(ids / f"{split}_{i:03d}.png")
-                    done += 1
-                    if progress:
-                        progress(done, total)
-                write_state(tmp / f"state_{state}", views, split)
-        _write_truth(tmp / "truth", model, centre, scale, seed, states)
-        if out.exists():
-            out.rmdir()
-        tmp.replace(out)
+        with whole_folder(out) as tmp:
+            surface = Surface(model, fine_texel(model, size, scale))
+            rng = np.random.default_rng((CAMERAS, seed))
+            total, done = states * (train_views + test_views), 0
+            for state in range(states):
+                scene = LitScene(surface, model.state(state))
+                ids = tmp / "truth" / f"partid_state{state}"
+                ids.mkdir(parents=True)
+                for split, count in (("train", train_views), ("test", test_views)):
+                    views = []
+                    for i, camera in enumerate(cameras_around(rng, count, size, distance, below)):
+                        # The scene stays in metres; the camera goes to it.
+                        T = camera.T_world_camera.copy()
+                        T[:3, 3] = T[:3, 3] / scale + centre
+                        rgba, depth, parts = scene.photograph(replace(camera, T_world_camera=T))
+                        views.append(View(camera, rgba, f"state_{state}/{split}/{i:03d}.png", depth * scale))
+                        Image.fromarray(parts).save(ids / f"{split}_{i:03d}.png")
+                        done += 1
+                        if progress:
+                            progress(done, total)
+                    write_state(tmp / f"state_{state}", views, split)
+            _write_truth(tmp / "truth", model, centre, scale, seed, states)
     except OSError as e:
         raise HingesplatError(f"{out}: cannot be written ({e.strerror or e})") from e
-    finally:
-        shutil.rmtree(tmp, ignore_errors=True)
     return out
 
 
@@ -165,7 +157,7 @@ def _write_truth(folder: Path, model: Model, centre: np.ndarray, scale: float, s
                 }
             )
     names = [b.name for b in model.bodies]
-    _write_json(
+    write_json(
         folder / "joints.json",
         {
             "frame": "world frame of the images, z up; parts/*.obj are at all joint values 0",
@@ -177,14 +169,10 @@ def _write_truth(folder: Path, model: Model, centre: np.ndarray, scale: float, s
             "joints": joints,
         },
     )
-    _write_json(folder / "meta.json", {"name": model.name, "seed": seed, "source": "hingesplat synth"})
+    write_json(folder / "meta.json", {"name": model.name, "seed": seed, "source": "hingesplat synth"})
 
 
 def _obj(vertices: np.ndarray, faces: np.ndarray) -> str:
     """A Wavefront OBJ file."""
     lines = ["v {:.9g} {:.9g} {:.9g}".format(*v) for v in vertices]
     return "\n".join(lines + ["f {} {} {}".format(*f) for f in faces + 1]) + "\n"
-
-
-def _write_json(path: Path, data: dict) -> None:
-    path.write_text(json.dumps(data, indent=1))
