@@ -23,12 +23,12 @@ from PIL import Image
 from hingesplat import cli
 from hingesplat.camera import Camera
 from hingesplat.capture.types import View
+from hingesplat.export.spz import spz_bytes
 from hingesplat.gaussians import SH_C0, Gaussians, posed
 from hingesplat.render import render
 from hingesplat.report import spread_views, write_report, write_views
 from hingesplat.report.curves import chart_rows
 from hingesplat.report.page import scene
-from hingesplat.report.spz import spz_bytes
 from hingesplat.twin import Joint, JointStd, Part, Twin
 
 SLIDE = Joint(

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from hingesplat.errors import HingesplatError
+from hingesplat.export.spz import spz_bytes
 from hingesplat.files import whole_file
 from hingesplat.gaussians import Gaussians
 from hingesplat.render import sh_basis
@@ -14,8 +15,6 @@ from hingesplat.se3 import matrix_to_wxyz, quat_multiply
 
 RUB = np.diag([1.0, -1.0, -1.0])
 """Turns the axes of splat PLYs (x right, y down, z forward) to those of SPZ (x right, y up, z back)."""
-SPZ_EXTENT = 32.0
-"""Smaller objects are enlarged to at least this for SPZ, which keeps 1/4096: then 1/130 000 of the object."""
 
 
 def _names(rest: int) -> list[str]:
@@ -47,8 +46,7 @@ def transformed(gaussians: Gaussians, R: np.ndarray, factor: float = 1.0) -> Gau
 def write_splats(gaussians: Gaussians, names: dict[int, str], out: Path, form: str) -> np.ndarray:
     """Write ``out/twin.FORM`` and ``out/NAME.FORM``, a file a part, in state 0.
 
-    PLY and SOG keep the coordinates given. SPZ rounds to 1/4096, so its Gaussians are centred and small
-    objects enlarged, all files alike, and its axes are those that SPZ viewers expect.
+    PLY and SOG keep the coordinates given; the axes of SPZ are those that its viewers expect.
 
     Args:
         gaussians: in the export's frame.
@@ -60,33 +58,31 @@ def write_splats(gaussians: Gaussians, names: dict[int, str], out: Path, form: s
         T_mesh_file (4, 4): takes coordinates in the files to those given.
 
     Raises:
-        HingesplatError: gaussforge, which writes SPZ and SOG, is absent or fails.
+        HingesplatError: gaussforge, which writes SOG, is absent or fails.
     """
     T_mesh_file = np.eye(4)
     g = gaussians.detached()
-    if form == "spz" and len(g):
-        low, high = g.means.double().amin(0), g.means.double().amax(0)
-        centre, extent = ((low + high) / 2).numpy(), float((high - low).norm())
-        factor = 2.0 ** max(0, np.ceil(np.log2(SPZ_EXTENT / max(extent, 1e-12))))
-        g = transformed(replace(g, means=(g.means.double() - torch.from_numpy(centre)).to(g.means.dtype)), RUB, factor)
-        T_mesh_file[:3, :3], T_mesh_file[:3, 3] = RUB.T / factor, centre
+    if form == "spz":
+        g, T_mesh_file[:3, :3] = transformed(g, RUB), RUB.T
     files = {"twin": g} | {name: g[g.part == i] for i, name in names.items()}
     for name, part in files.items():
-        if len(part):
-            write_ply(part, out / f"{name}.ply")
-            if form != "ply":
-                _convert(out / f"{name}.ply", out / f"{name}.{form}")
+        path = out / f"{name}.{form}"
+        if len(part) and form == "spz":
+            path.write_bytes(spz_bytes(part))
+        elif len(part):
+            write_ply(part, path.with_suffix(".ply"))
+            if form == "sog":
+                _to_sog(path.with_suffix(".ply"), path)
     return T_mesh_file
 
 
-def _convert(source: Path, target: Path) -> None:
-    """A PLY to what the target's suffix says; the PLY goes."""
+def _to_sog(source: Path, target: Path) -> None:
+    """A PLY to SOG; the PLY goes."""
     try:
         from gaussforge import GaussForge
     except ImportError as e:
-        form = target.suffix[1:]
-        raise HingesplatError(f"{form}: needs the package gaussforge; pip install 'hingesplat[splats]'") from e
-    made = GaussForge().convert(source.read_bytes(), "ply", target.suffix[1:])
+        raise HingesplatError("sog: needs the package gaussforge; pip install 'hingesplat[splats]'") from e
+    made = GaussForge().convert(source.read_bytes(), "ply", "sog")
     source.unlink()
     if "error" in made:
         raise HingesplatError(f"{target}: cannot be made: {made['error']}; export PLY instead")

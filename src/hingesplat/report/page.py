@@ -15,11 +15,11 @@ import numpy as np
 import torch
 
 from hingesplat.errors import HingesplatError
+from hingesplat.export.spz import MAX_DEGREE, spz_bytes
 from hingesplat.files import write_text
 from hingesplat.gaussians import Gaussians, posed
 from hingesplat.pictures import part_colour
 from hingesplat.report.curves import chart_rows
-from hingesplat.report.spz import MAX_DEGREE, spz_bytes
 from hingesplat.twin import Joint, Twin
 
 SPLAT_BYTES = 5_500_000

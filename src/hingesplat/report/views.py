@@ -12,6 +12,7 @@ from hingesplat.camera import Camera
 from hingesplat.capture.types import View
 from hingesplat.files import write_json
 from hingesplat.gaussians import Gaussians
+from hingesplat.pictures import fitted
 from hingesplat.render import render
 
 
@@ -48,10 +49,9 @@ def write_views(
     entries = []
     for state, (views, gaussians) in enumerate(states):
         for number, view in enumerate(views):
-            shrink = min(1.0, size / max(view.camera.width, view.camera.height))
-            width, height = (max(1, round(side * shrink)) for side in (view.camera.width, view.camera.height))
-            photo = Image.fromarray(view.rgba, "RGBA").resize((width, height), Image.Resampling.LANCZOS)
-            twin = _cut_out(gaussians, view.camera.scaled(width, height))
+            camera = fitted(view.camera, min(size, max(view.camera.width, view.camera.height)))
+            photo = Image.fromarray(view.rgba, "RGBA").resize((camera.width, camera.height), Image.Resampling.LANCZOS)
+            twin = _cut_out(gaussians, camera)
             error = float(np.square(_on_white(photo) - _on_white(twin)).mean())
             names = {what: f"state{state}_{number}_{what}.webp" for what in ("photo", "twin")}
             photo.save(folder / names["photo"], quality=85)
@@ -61,7 +61,7 @@ def write_views(
                     "state": state,
                     "name": view.name,
                     **names,
-                    "size": [width, height],
+                    "size": [camera.width, camera.height],
                     "psnr": -10 * math.log10(max(error, 1e-10)),
                     "camera": {"position": view.camera.centre.tolist(), "focal_pixels": view.camera.fy},
                 }
