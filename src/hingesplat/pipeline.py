@@ -57,9 +57,9 @@ NOISE = 10
 SHOWN_VIEWS = 3
 """Photographs of each state that the report shows beside the twin."""
 ARTEFACTS = (
-    *("config.json", "stages.json", "curves.json", "log.txt", "fit_state*.safetensors", "segmentation.*"),
+    *("config.json", "stages.json", "log.txt", "fit_state*.safetensors", "segmentation.*"),
     *("canonical.safetensors", "articulation.safetensors", "gaussians*.safetensors", "twin.json"),
-    *("parts", "export", "views", "motion.gif", "summary.*", "metrics.json", "report.html", "*.tmp"),
+    *("parts", "export", "curves.json", "views", "motion.gif", "summary.*", "metrics.json", "report.html", "*.tmp"),
 )
 """Everything that a run folder holds; ``overwrite`` deletes these and nothing else."""
 
