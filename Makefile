@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 PIP_INSTALL := $(BIN)/python -m pip install -c constraints.txt
 
-.PHONY: demo test lint bench
+.PHONY: demo test lint bench web
 .DELETE_ON_ERROR:
 
 demo: .venv/stamp-run  ## make an object, photograph it in two states, rebuild it as a moving twin in demo/
@@ -21,6 +21,9 @@ lint: .venv/stamp-dev
 bench: .venv/stamp-dev  ## measure, write benchmarks/results/, and set the table in README.md
 	$(BIN)/python benchmarks/run.py --readme README.md
 
+web:  ## bundle the moving part of report.html anew, after a change in web/; needs Node.js
+	cd web && npm ci && npm run build
+
 # torch first, by itself and pinned: a looser wish of another package must not pick a different build.
 .venv/stamp-torch: constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "hingesplat needs Python 3.11 or later")'
@@ -34,5 +37,5 @@ bench: .venv/stamp-dev  ## measure, write benchmarks/results/, and set the table
 	@touch $@
 
 .venv/stamp-dev: .venv/stamp-torch pyproject.toml
-	$(PIP_INSTALL) -e '.[dev,sim]'
+	$(PIP_INSTALL) -e '.[dev,sim,usd,splats,view,video]'
 	@touch $@ .venv/stamp-run

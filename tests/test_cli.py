@@ -237,7 +237,7 @@ def test_other_commands_name_what_is_missing(tmp_path: Path, made: Path, capfd) 
     nothing = str(tmp_path / "nothing")
     for args, word in (
         (["evaluate", nothing, "--truth", str(made)], "no such run folder"),
-        (["export", nothing], "twin.json"),
+        (["export", nothing], "no such run folder"),
         (["synth", "teapot", "--out", nothing], "teapot"),
         (["synth", "laptop", "--out", str(made)], "already there"),
     ):

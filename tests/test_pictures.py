@@ -10,7 +10,7 @@ from PIL import Image
 from hingesplat.camera import Camera
 from hingesplat.capture.types import View
 from hingesplat.gaussians import SH_C0, Gaussians
-from hingesplat.pictures import _sweep, _values, in_part_colours, part_colour, write_motion_gif, write_summary
+from hingesplat.pictures import _sweep, in_part_colours, part_colour, sweep_values, write_motion_gif, write_summary
 from hingesplat.twin import Joint, Part, Twin
 
 
@@ -84,7 +84,7 @@ def test_a_sweep_starts_and_ends_at_rest_and_reaches_both_limits(limits: tuple[f
 
 def test_every_joint_has_its_turn():
     joints = [Joint(i, 0, "revolute", (0, 0, 1), (0, 0, 0), (0.0, 1.0), (0.0, 1.0)) for i in (1, 2, 3)]
-    values = np.array([list(_values(joints, t).values()) for t in np.linspace(0, 1, 401)])
+    values = np.array([list(sweep_values(joints, t).values()) for t in np.linspace(0, 1, 401)])
     assert values.max(0) == pytest.approx(np.ones(3), abs=1e-3)
     assert (values[0] == 0).all() and (values[-1] == 0).all()
     assert list(values.argmax(0)) == sorted(values.argmax(0))

@@ -24,7 +24,8 @@ from hingesplat.twin import Part, Twin
 
 @pytest.fixture(scope="module")
 def cabinet(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make("cabinet", tmp_path_factory.mktemp("made") / "cabinet", size=128, train_views=30, test_views=3)
+    out = tmp_path_factory.mktemp("made") / "cabinet"
+    return make("cabinet", out, size=128, train_views=30, test_views=3, below=0.125)
 
 
 @pytest.fixture(scope="module")
@@ -254,10 +255,13 @@ def test_identical_states_give_a_static_twin(cabinet: Path, tmp_path: Path) -> N
     config = replace(small_config(), fit=replace(small_config().fit, steps=200))
     twin = reconstruct(capture, config, out=tmp_path / "run")
     assert [part.name for part in twin.parts] == ["base"] and twin.joints == ()
+    curves = json.loads((tmp_path / "run" / "curves.json").read_text())
+    assert list(curves) == ["fit state 0", "fit state 1"] and curves["fit state 1"]["step"][-1] == 200
     assert "no motion found between state 0 and state 1" in (tmp_path / "run" / "log.txt").read_text()
     for name in (
-        *("parts/base.ply", "parts/base.glb", "parts/base.obj", "export/twin.urdf", "export/twin.xml"),
+        *("parts/base.ply", "parts/base.glb", "parts/base.obj", "export/urdf/twin.urdf", "export/mjcf/twin.xml"),
         *("gaussians_state0.safetensors", "gaussians_state1.safetensors", "motion.gif", "summary.png"),
+        *("report.html", "views/views.json"),
     ):
         assert (tmp_path / "run" / name).stat().st_size > 0, name
 
@@ -278,3 +282,22 @@ def test_a_door_and_a_drawer_from_photographs_alone(cabinet: Path, capture: Capt
     assert metrics["views"]["psnr"] > 24
     again = Twin.load(run / "twin.json")
     assert again == twin
+
+
+def test_curves_go_on_where_a_run_goes_on(tmp_path: Path) -> None:
+    heard: list[dict] = []
+    curves = pipeline.Curves(tmp_path / "curves.json", lambda **k: heard.append(k))
+
+    def step(n: int) -> dict:
+        return {"stage": "fit", "state": 0, "step": n, "steps": 9, "loss": 1.0 / n, "psnr": 3.0 * n, "gaussians": 7}
+
+    for event in ({"stage": "fit"}, step(1), step(5), step(9), step(2), {"stage": "fit", "seconds": 1.5}):
+        curves.report(**event)
+    assert len(heard) == 6 and heard[1] == step(1) and heard[-1] == {"stage": "fit", "seconds": 1.5}
+    curves.save()
+    again = pipeline.Curves(tmp_path / "curves.json", lambda **_: None)
+    assert again.series["fit state 0"]["step"] == [1, 5, 9]  # Step 2 belongs to a trial after the fit.
+    again.report(stage="joints")
+    assert again.series == curves.series
+    again.report(stage="fit")
+    assert again.series == {}

@@ -14,13 +14,12 @@ from hingesplat.gaussians import Gaussians
 from hingesplat.losses.articulation import articulation_loss
 from hingesplat.losses.contact import contact_loss
 from hingesplat.losses.part import nearest_neighbours, part_loss, part_probabilities, soft_motion
-from hingesplat.losses.photometric import psnr
 from hingesplat.losses.repel import repel_force, sample_repel_points
 from hingesplat.losses.vector_field import vector_loss
 from hingesplat.losses.velocity import fit_parts, velocity_loss
 from hingesplat.optim import GaussianAdam, LearningRates
 from hingesplat.poses import PoseDelta, StateLossConfig, move, part_centres, state_loss
-from hingesplat.training import Report, grow, shuffled, training_view
+from hingesplat.training import Report, averaged, grow, shuffled, training_view
 
 
 @dataclass(frozen=True)
@@ -115,10 +114,11 @@ def articulate(
     extra = {"state_sh": (torch.zeros((len(canonical), len(views) - 1, 3)), config.rates.sh)}
     optimiser = GaussianAdam(canonical, config.rates, extent, extra | identity.extra)
     training = [[training_view(v) for v in state] for state in views]
-    repel_points = _repel_points(canonical, config, generator)
+    repel_points = draw_repel_points(canonical, config, generator)
     photographs = shuffled(training, rng)
     statistics = torch.zeros((len(optimiser), 3))
     targets: list[_Targets] = []
+    tell = averaged(report, config.steps)
     for step in range(config.steps):
         progress = step / config.steps
         state, view = next(photographs)
@@ -145,14 +145,7 @@ def articulate(
             statistics = torch.zeros((len(optimiser), 3))
             identity.stale()
             targets = []  # Rows have changed places.
-        if step % 50 == 0 or step == config.steps - 1:
-            report(
-                step=step + 1,
-                steps=config.steps,
-                loss=float(loss.detach()),
-                psnr=float(psnr(image.detach()[:3], view.image[:3])),
-                gaussians=len(optimiser),
-            )
+        tell(loss, image, view, len(optimiser))
     return _result(optimiser, poses)
 
 
@@ -222,7 +215,8 @@ class _Identity:
         return True
 
 
-def _repel_points(g: Gaussians, config: ArticulateConfig, generator: torch.Generator) -> Tensor | None:
+def draw_repel_points(g: Gaussians, config: ArticulateConfig, generator: torch.Generator) -> Tensor | None:
+    """Points (n, 3) of the base that movable Gaussians are pushed off; None where the config wants none."""
     if not config.repel or not (g.part > 0).any():
         return None
     base = g.part == 0

@@ -1,5 +1,6 @@
 """A pinhole camera. OpenCV axes: x right, y down, z forward; pixel centres at +0.5."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -70,3 +71,31 @@ class Camera:
         d = np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones_like(u)], axis=-1)
         d = d @ self.T_world_camera[:3, :3].T
         return self.centre, d / np.linalg.norm(d, axis=-1, keepdims=True)
+
+
+def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """T_world_camera (4, 4) of a camera at ``eye`` that looks towards ``target``; ``up`` must not point there too."""
+    forward = target - eye
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, up)
+    right = right / np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+    T[:3, 3] = eye
+    return T
+
+
+def common_up(cameras: Sequence[Camera]) -> np.ndarray:
+    """The unit vector (3,) that is up for people who hold their cameras level: the normal of all right axes.
+
+    Where these do not span a plane it is the mean of the cameras' own; an axis within 10° is taken for it.
+    """
+    R = np.stack([c.T_world_camera[:3, :3] for c in cameras])
+    mean = -R[:, :, 1].mean(0)
+    _, spread, axes = np.linalg.svd(R[:, :, 0], full_matrices=False)
+    up = axes[2] if len(spread) == 3 and spread[1] > 0.2 * spread[0] else mean
+    if np.linalg.norm(up) < 1e-6:
+        up = np.array([0.0, 0.0, 1.0])
+    up = up / np.linalg.norm(up) * (1 if up @ mean >= 0 else -1)
+    axis = np.eye(3)[np.abs(up).argmax()] * np.sign(up[np.abs(up).argmax()])
+    return axis if axis @ up > np.cos(np.radians(10)) else up

@@ -4,12 +4,12 @@ import logging
 import os
 import sys
 import tempfile
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, make_dataclass, replace
-from dataclasses import field as dataclass_field
+from dataclasses import dataclass, field, make_dataclass, replace
 from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -24,8 +24,10 @@ from rich.text import Text
 
 import hingesplat
 from hingesplat.errors import HingesplatError
+from hingesplat.export import FORMATS, ExportConfig, export_twin
 
 if TYPE_CHECKING:
+    from hingesplat.export.check import Check
     from hingesplat.pipeline import ReconstructConfig
     from hingesplat.twin import Twin
 
@@ -66,6 +68,175 @@ class Reconstruct:
 
 
 @dataclass(frozen=True)
+class View:
+    """Look at a run (splats, meshes, joints on sliders, photographs) or a capture (cameras, hulls) in the browser."""
+
+    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN|CAPTURE")]
+    """A run folder or a capture."""
+    host: str = "127.0.0.1"
+    """Address to listen on; 0.0.0.0 lets other machines in."""
+    port: int = 8080
+    """Port to listen on."""
+    quiet: bool = False
+    """Say nothing but warnings and errors."""
+
+    def run(self, console: Console) -> None:
+        from hingesplat.viewer import open_viewer
+
+        with open_viewer(self.folder, host=self.host, port=self.port) as viewer:
+            console.print(f"{viewer.url} shows {escape(str(self.folder))}; Ctrl-C ends it", soft_wrap=True)
+            with suppress(KeyboardInterrupt):
+                threading.Event().wait()
+
+
+@dataclass(frozen=True)
+class Render:
+    """Film a run's twin, drawn from its splats: around it, its joints moving, or one after the other."""
+
+    run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """A run folder."""
+    out: Path
+    """The film: .mp4 or .gif."""
+    what: Literal["orbit", "sweep", "both"] = "both"
+    """Once around it; the joints through their range and back; both, one after the other."""
+    size: int = 720
+    """Width and height, pixels."""
+    fps: float = 30
+    """Pictures a second."""
+    seconds: float = 8
+    """Of the whole film, which loops."""
+    quiet: bool = False
+    """Say nothing but warnings and errors."""
+
+    def run(self, console: Console) -> None:
+        from hingesplat.pipeline import load_result, up_of
+        from hingesplat.video import write_video
+
+        gaussians, twin = load_result(self.run_folder)
+        with StageProgress(console) as report:
+            write_video(
+                self.out,
+                gaussians,
+                twin,
+                what=self.what,
+                up=up_of(self.run_folder),
+                size=self.size,
+                fps=self.fps,
+                seconds=self.seconds,
+                report=report,
+            )
+        console.print(f"written: {escape(str(self.out))}", soft_wrap=True)
+
+
+@dataclass(frozen=True)
+class Report:
+    """Write RUN/report.html anew: the twin with sliders, joints, pictures, curves, in one file for any browser."""
+
+    run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """A run folder."""
+    quiet: bool = False
+    """Say nothing but warnings and errors."""
+
+    def run(self, console: Console) -> None:
+        from hingesplat.report import write_report
+
+        console.print(f"written: {escape(str(write_report(self.run_folder)))}", soft_wrap=True)
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a run's twin for simulators and splat viewers, each format into a folder that can be moved."""
+
+    run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """A run folder."""
+    format: Annotated[tuple[str, ...], tyro.conf.arg(metavar=f"{{{','.join(FORMATS)}}} ...")] = ("urdf", "mjcf")
+    """One or more; OUT/FORMAT is what is written."""
+    out: Path | None = None
+    """Folder to write to; RUN/export if none is given."""
+    options: Annotated[ExportConfig, tyro.conf.arg(name="")] = field(default_factory=ExportConfig)
+    check: bool = True
+    """Whether what was written is loaded in the simulators installed, and each joint driven end to end."""
+    quiet: bool = False
+    """Say nothing but warnings and errors."""
+
+    def run(self, console: Console) -> None:
+        from hingesplat.export.check import check_export
+        from hingesplat.pipeline import load_meshes, load_result
+
+        gaussians, twin = load_result(self.run_folder)
+        meshes = load_meshes(self.run_folder, twin)
+        home = self.run_folder / "export"
+        paths = export_twin(twin, meshes, gaussians, self.out or home, self.format, self.options, cache=home / ".hulls")
+        for form, path in paths.items():
+            console.print(f"written: {escape(str(path))}", soft_wrap=True)
+            for check in check_export(form, path) if self.check else ():
+                show_check(console, form, check)
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Compare a run with the truth; every number goes to RUN/metrics.json, and into RUN/report.html."""
+
+    run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """A run folder."""
+    truth: Path
+    """Folder of the truth, or the capture that holds it."""
+    quiet: bool = False
+    """Say nothing but warnings and errors."""
+
+    def run(self, console: Console) -> None:
+        from hingesplat.export.check import simulation
+        from hingesplat.metrics import evaluate
+        from hingesplat.report import write_report
+
+        show_metrics(console, evaluate(self.run_folder, self.truth, simulation(self.run_folder / "export")))
+        write_report(self.run_folder)
+        console.print(f"written: {escape(str(self.run_folder / 'metrics.json'))}", soft_wrap=True)
+
+
+@dataclass(frozen=True)
+class Synth:
+    """Make an articulated object and its photographs: a capture with its truth beside it."""
+
+    name: tyro.conf.Positional[str]
+    """What to make: docs/objects.png shows all; an unknown name lists them."""
+    out: Path
+    """Folder for the capture."""
+    seed: int = 0
+    """Draws shape, textures, joint values and cameras."""
+    size: int = 400
+    """Width and height of the pictures, pixels."""
+    views: int = 100
+    """Training views a state."""
+    test_views: int = 20
+    """Test views a state."""
+    states: int = 2
+    """Those after the second have joint values between those of the first two."""
+    below: float = 0.0
+    """Share of the views that look up from slightly below; the others are on the upper hemisphere."""
+    quiet: bool = False
+    """Say nothing but warnings and errors."""
+
+    def run(self, console: Console) -> None:
+        from hingesplat.synth import make
+
+        with StageProgress(console) as report:
+            report(stage="synth")
+            make(
+                self.name,
+                self.out,
+                seed=self.seed,
+                size=self.size,
+                train_views=self.views,
+                test_views=self.test_views,
+                states=self.states,
+                below=self.below,
+                progress=lambda done, total: report(stage="synth", step=done, steps=total),
+            )
+        console.print(f"written: {escape(str(self.out))}", soft_wrap=True)
+
+
+@dataclass(frozen=True)
 class Demo:
     """Make a cabinet of a door and a drawer, photograph it, rebuild it as a twin, and measure the twin."""
 
@@ -80,15 +251,18 @@ class Demo:
 
     def run(self, console: Console) -> None:
         from hingesplat.capture import load_capture
+        from hingesplat.export.check import simulation
         from hingesplat.metrics import evaluate
+        from hingesplat.report import write_report
 
         started = time.perf_counter()
         capture, run = self.out / "capture", self.out / "run"
         if not (capture / "truth" / "meta.json").is_file():
-            Synth("cabinet", capture, size=200, views=60).run(console)
+            Synth("cabinet", capture, size=200, views=60, test_views=10, below=0.125).run(console)
         twin = _reconstruct(load_capture(capture), demo_config(), run, True, console)
         show_joints(console, twin)
-        show_metrics(console, evaluate(run, capture / "truth"))
+        show_metrics(console, evaluate(run, capture / "truth", simulation(run / "export")))
+        write_report(run)
         show_paths(console, run)
         console.print(f"{time.perf_counter() - started:.0f} s in all")
 
@@ -106,95 +280,7 @@ def demo_config() -> "ReconstructConfig":
     )
 
 
-@dataclass(frozen=True)
-class Evaluate:
-    """Compare a run with the truth; every number goes to RUN/metrics.json."""
-
-    run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-    """A run folder."""
-    truth: Path
-    """Folder of the truth, or the capture that holds it."""
-    quiet: bool = False
-    """Say nothing but warnings and errors."""
-
-    def run(self, console: Console) -> None:
-        from hingesplat.metrics import evaluate
-
-        show_metrics(console, evaluate(self.run_folder, self.truth))
-        console.print(f"written: {escape(str(self.run_folder / 'metrics.json'))}", soft_wrap=True)
-
-
-@dataclass(frozen=True)
-class Synth:
-    """Make an articulated object and its photographs: a capture with its truth beside it."""
-
-    name: tyro.conf.Positional[str]
-    """cabinet (a door and a drawer) or laptop."""
-    out: Path
-    """Folder for the capture."""
-    seed: int = 0
-    """Draws shape, textures, joint values and cameras."""
-    size: int = 400
-    """Width and height of the pictures, pixels."""
-    views: int = 60
-    """Training views a state; ten more are test views."""
-    quiet: bool = False
-    """Say nothing but warnings and errors."""
-
-    def run(self, console: Console) -> None:
-        from hingesplat.synth import make
-
-        with StageProgress(console) as report:
-            report(stage="synth")
-            make(
-                self.name,
-                self.out,
-                seed=self.seed,
-                size=self.size,
-                train_views=self.views,
-                progress=lambda done, total: report(stage="synth", step=done, steps=total),
-            )
-        console.print(f"written: {escape(str(self.out))}", soft_wrap=True)
-
-
-@dataclass(frozen=True)
-class Export:
-    """Write a run's twin for simulators and viewers."""
-
-    run_folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-    """A run folder."""
-    format: tuple[Literal["urdf", "mjcf", "ply"], ...] = ("urdf", "mjcf")
-    """ply: the whole twin in state 0 as one file of splats."""
-    out: Path | None = None
-    """Folder to write to; RUN/export if none is given."""
-    quiet: bool = False
-    """Say nothing but warnings and errors."""
-
-    def run(self, console: Console) -> None:
-        from hingesplat.export.mjcf import write_mjcf
-        from hingesplat.export.splats import write_ply
-        from hingesplat.export.urdf import write_urdf
-        from hingesplat.gaussians import Gaussians
-        from hingesplat.pipeline import load_meshes
-        from hingesplat.twin import Twin
-
-        twin = Twin.load(self.run_folder / "twin.json")
-        meshes = load_meshes(self.run_folder, twin)
-        out = self.out or self.run_folder / "export"
-        out.mkdir(parents=True, exist_ok=True)
-        for name in dict.fromkeys(self.format):
-            match name:
-                case "urdf":
-                    path = write_urdf(twin, meshes, out, scale=twin.metres_per_unit)
-                case "mjcf":
-                    path = write_mjcf(twin, meshes, out, scale=twin.metres_per_unit)
-                case "ply":
-                    path = out / "twin.ply"
-                    write_ply(Gaussians.load(self.run_folder / "gaussians.safetensors"), path)
-            console.print(f"written: {escape(str(path))}", soft_wrap=True)
-
-
-Command = Reconstruct | Demo | Evaluate | Synth | Export
+Command = Reconstruct | View | Render | Report | Export | Evaluate | Synth | Demo
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -234,7 +320,7 @@ def parse_reconstruct(args: list[str]) -> Reconstruct:
 
     def parsed(default: ReconstructConfig) -> Any:
         nested: Any = Annotated[ReconstructConfig, tyro.conf.arg(name="")]
-        fields = [("config", nested, dataclass_field(default=default, kw_only=True))]
+        fields = [("config", nested, field(default=default, kw_only=True))]
         full = make_dataclass("Reconstruct", fields, bases=(Reconstruct,), frozen=True)
         prog = "hingesplat reconstruct"
         return tyro.cli(full, args=args, prog=prog, description=Reconstruct.__doc__, config=FLAGS)
@@ -378,18 +464,37 @@ def show_metrics(console: Console, metrics: dict[str, Any]) -> None:
     rest = Table(*numbers, box=SIMPLE_HEAD)
     rest.add_row(*numbers.values())
     console.print(rest)
+    if (row := metrics.get("simulation")) is not None:
+        worst = max(row[form]["error_percent"] or 0.0 for form in ("mjcf", "urdf"))
+        how = f"worst tracking error {worst:.2g} % of range" if row["ok"] else "fails; metrics.json says how"
+        console.print(f"exports in {row['program']}: {how}")
     if views.get("why_null"):
         console.print(f"no pictures compared: {escape(views['why_null'])}", soft_wrap=True)
+
+
+def show_check(console: Console, form: str, check: "Check") -> None:
+    """What a simulator made of an export; to stderr, too, what went wrong."""
+    parts = [f"{check.joints} joint{'' if check.joints == 1 else 's'}"]
+    if check.error_percent is not None:
+        parts.append(f"worst tracking error {check.error_percent:.2g} % of range")
+        parts.append(f"contacts: {'; '.join(check.contacts) or 'none'}")
+    parts.append(f"warnings: {len(check.warnings) or 'none'}")
+    console.print(f"  {form} in {check.program}: {', '.join(parts)}", soft_wrap=True)
+    for warning in check.warnings:
+        _say(f"{form} in {check.program}: {warning}")
+    if not check.ok and not check.warnings:
+        _say(f"{form} in {check.program}: a joint misses its end by {check.error_percent:.2g} % of its range")
 
 
 def show_paths(console: Console, run: Path) -> None:
     """What a run wrote and what it is for."""
     table = Table.grid(padding=(0, 2))
     for name, what in {
+        "report.html": "the twin in a browser",
         "twin.json": "parts and joints",
         "parts": "splats and meshes",
-        "export/twin.urdf": "for robotics",
-        "export/twin.xml": "for MuJoCo",
+        "export/urdf/twin.urdf": "for robotics",
+        "export/mjcf/twin.xml": "for MuJoCo",
         "motion.gif": "the joints moving",
         "summary.png": "photographs, renders, parts",
         "metrics.json": "beside the truth",

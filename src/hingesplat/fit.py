@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hingesplat.capture import View, visual_hull
 from hingesplat.gaussians import SH_C0, Gaussians
-from hingesplat.losses.photometric import photometric, psnr
+from hingesplat.losses.photometric import photometric
 from hingesplat.optim import GaussianAdam, LearningRates, morton_order
 from hingesplat.render import render
 from hingesplat.stereo import Cloud, DepthMap, fused, seen_through
@@ -20,6 +20,7 @@ from hingesplat.surface import thin
 from hingesplat.training import (
     Report,
     TrainingView,
+    averaged,
     depth_and_its_square,
     depth_variance,
     four_planes,
@@ -162,6 +163,7 @@ def _optimise(
     cameras = [v.camera for v in training]
     statistics = torch.zeros((len(optimiser), 3))
     photographs = shuffled([training], rng)
+    tell = averaged(report, config.steps)
     for step in range(config.steps):
         progress = step / config.steps
         _, view = next(photographs)
@@ -175,14 +177,7 @@ def _optimise(
         if growing and step % 500 == 0:
             optimiser.select(seen_weight(optimiser.gaussians.detached(), cameras) > 0.5)
             statistics = torch.zeros((len(optimiser), 3))
-        if step % 50 == 0 or step == config.steps - 1:
-            report(
-                step=step + 1,
-                steps=config.steps,
-                loss=float(loss.detach()),
-                psnr=float(psnr(image.detach()[:3], view.image[:3])),
-                gaussians=len(optimiser),
-            )
+        tell(loss, image, view, len(optimiser))
 
 
 def _view_loss(

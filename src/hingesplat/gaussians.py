@@ -12,6 +12,7 @@ from torch import Tensor
 
 from hingesplat import se3
 from hingesplat.errors import HingesplatError
+from hingesplat.files import whole_file
 
 SH_C0 = 0.28209479177387814  # value of the constant spherical harmonic
 
@@ -67,9 +68,8 @@ class Gaussians:
 
     def save(self, path: Path) -> None:
         """Write a safetensors file, whole or not at all."""
-        tmp = path.with_name(path.name + ".tmp")
-        save_file({f.name: getattr(self, f.name).detach().contiguous() for f in fields(self)}, str(tmp))
-        tmp.replace(path)
+        with whole_file(path) as tmp:
+            save_file({f.name: getattr(self, f.name).detach().contiguous() for f in fields(self)}, str(tmp))
 
     @staticmethod
     def load(path: Path) -> "Gaussians":

@@ -11,12 +11,12 @@ from torch import Tensor
 
 from hingesplat.capture import View
 from hingesplat.gaussians import Gaussians
-from hingesplat.losses.photometric import photometric, psnr
+from hingesplat.losses.photometric import photometric
 from hingesplat.optim import GaussianAdam, LearningRates
 from hingesplat.poses import StateLossConfig, draw_state, part_centres, state_loss
 from hingesplat.screw import matrix_to_screw
 from hingesplat.se3 import rotvec_to_matrix
-from hingesplat.training import Report, TrainingView, four_planes, shuffled, training_view
+from hingesplat.training import Report, TrainingView, averaged, four_planes, shuffled, training_view
 from hingesplat.twin import Joint, JointStd, JointType
 
 log = logging.getLogger(__name__)
@@ -156,6 +156,7 @@ def find_joints(
     optimiser = GaussianAdam(gaussians, config.rates, extent, extra)
     adam = torch.optim.Adam([poses.theta], lr=config.rate)
     photographs = shuffled(training, rng)
+    tell = averaged(report, config.steps)
     for step in range(config.steps):
         progress = step / config.steps
         state, view = next(photographs)
@@ -164,14 +165,7 @@ def find_joints(
         loss.backward()
         optimiser.step(progress)
         _joint_step(adam, config.rate, progress)
-        if step % 50 == 0 or step == config.steps - 1:
-            report(
-                step=step + 1,
-                steps=config.steps,
-                loss=float(loss.detach()),
-                psnr=float(psnr(image.detach()[:3], view.image[:3])),
-                gaussians=len(optimiser),
-            )
+        tell(loss, image, view, len(optimiser))
     finished = optimiser.gaussians.detached()
     offsets = optimiser.values["state_sh"].detach().permute(1, 0, 2)
     all_sh = torch.cat([torch.zeros_like(offsets[:1]), offsets]).contiguous()

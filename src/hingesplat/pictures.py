@@ -3,7 +3,7 @@
 import colorsys
 import io
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from hingesplat.camera import Camera
 from hingesplat.capture.types import View
+from hingesplat.files import whole_file
 from hingesplat.gaussians import SH_C0, Gaussians, posed
 from hingesplat.render import render
 from hingesplat.twin import Joint, Twin
@@ -57,14 +58,11 @@ def write_summary(
     """
     rows = []
     for view, poses in states:
-        camera = _fitted(view.camera, size)
+        camera = fitted(view.camera, size)
         scene = posed(gaussians.detached(), poses)
-        photo = Image.fromarray(view.rgba, "RGBA")
-        white = Image.new("RGBA", photo.size, "white")
-        photo = Image.alpha_composite(white, photo).convert("RGB")
-        photo = photo.resize((camera.width, camera.height), Image.Resampling.LANCZOS)
-        rows.append([photo, _picture(scene, camera), _picture(in_part_colours(scene), camera)])
-    _save(path, lambda file: _grid(rows, ("photograph", "twin", "parts")).save(file, "PNG"))
+        rows.append([photograph(view, camera), picture(scene, camera), picture(in_part_colours(scene), camera)])
+    with whole_file(path) as tmp:
+        _grid(rows, ("photograph", "twin", "parts")).save(tmp, "PNG")
 
 
 def write_motion_gif(
@@ -88,20 +86,21 @@ def write_motion_gif(
         size: longest side, pixels.
         max_bytes: the pictures shrink until the file is at most this long.
     """
-    camera = _fitted(camera, size)
+    camera = fitted(camera, size)
     scene = gaussians.detached()
     moving = [j for j in twin.joints if j.type != "fixed"]
     times = np.arange(frames if moving else 1) / frames
-    pictures = [_picture(posed(scene, twin.transforms(_values(moving, t))), camera) for t in times]
-    data = _encode(pictures)
+    pictures = [picture(posed(scene, twin.transforms(sweep_values(moving, t))), camera) for t in times]
+    data = encode_gif(pictures)
     while len(data) > max_bytes and min(pictures[0].size) > 32:
         smaller = tuple(int(0.85 * s) for s in pictures[0].size)
         pictures = [p.resize((smaller[0], smaller[1]), Image.Resampling.LANCZOS) for p in pictures]
-        data = _encode(pictures)
-    _save(path, lambda file: file.write(data))
+        data = encode_gif(pictures)
+    with whole_file(path) as tmp:
+        tmp.write_bytes(data)
 
 
-def _values(joints: Sequence[Joint], time: float) -> dict[int, float]:
+def sweep_values(joints: Sequence[Joint], time: float) -> dict[int, float]:
     """Joint values by child at a time in [0, 1): each has its turn, half of it shared with the next one's."""
     turn = 2 / (len(joints) + 1)
     return {j.child: _sweep(j, (time - i * turn / 2) / turn) for i, j in enumerate(joints)}
@@ -125,15 +124,32 @@ def _sweep(joint: Joint, phase: float) -> float:
     return float(stops[leg] + ease * (stops[leg + 1] - stops[leg]))
 
 
-def _fitted(camera: Camera, size: int) -> Camera:
+def fitted(camera: Camera, size: int) -> Camera:
+    """The same view, its longest side ``size`` pixels."""
     shrink = size / max(camera.width, camera.height)
     return camera.scaled(max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink)))
 
 
-def _picture(gaussians: Gaussians, camera: Camera) -> Image.Image:
+def photograph(view: View, camera: Camera) -> Image.Image:
+    """A photograph on white, at the camera's size."""
+    photo = Image.fromarray(view.rgba, "RGBA")
+    white = Image.new("RGBA", photo.size, "white")
+    photo = Image.alpha_composite(white, photo).convert("RGB")
+    return photo.resize((camera.width, camera.height), Image.Resampling.LANCZOS)
+
+
+def picture(gaussians: Gaussians, camera: Camera) -> Image.Image:
+    """What the camera sees, on white."""
     with torch.no_grad():
         rgb: Tensor = render(gaussians, camera, background=torch.ones(3)).rgb
     return Image.fromarray((rgb.clamp(0, 1).permute(1, 2, 0).cpu().numpy() * 255).round().astype(np.uint8))
+
+
+@torch.no_grad()
+def movable_share(gaussians: Gaussians, camera: Camera, size: int = 64) -> float:
+    """How much of the camera's picture movable parts cover, 0 to 1, judged at ``size`` pixels."""
+    movable = (gaussians.part > 0).to(gaussians.means)[:, None]
+    return float(render(gaussians, fitted(camera, size), channels=movable).channels.mean())
 
 
 def _grid(rows: list[list[Image.Image]], titles: Sequence[str]) -> Image.Image:
@@ -154,8 +170,8 @@ def _grid(rows: list[list[Image.Image]], titles: Sequence[str]) -> Image.Image:
     return sheet
 
 
-def _encode(pictures: Sequence[Image.Image]) -> bytes:
-    """One palette for all frames, so that nothing flickers."""
+def encode_gif(pictures: Sequence[Image.Image], fps: float = 20) -> bytes:
+    """A looping GIF of at most 50 frames a second; one palette for all of them, so that nothing flickers."""
     step = max(1, len(pictures) // 6)
     samples = pictures[::step]
     strip = Image.new("RGB", (sum(p.width for p in samples), samples[0].height))
@@ -166,13 +182,10 @@ def _encode(pictures: Sequence[Image.Image]) -> bytes:
     colours[(colours > 247).all(1)] = 255  # white stays white
     palette.putpalette(colours.ravel().tolist())
     indexed = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
+    # A frame lasts whole hundredths of a second: some longer, some shorter, so that the whole keeps time.
+    lengths = np.diff(np.round(np.arange(len(indexed) + 1) * 100 / fps)).astype(int) * 10
     file = io.BytesIO()
-    indexed[0].save(file, "GIF", save_all=True, append_images=indexed[1:], duration=50, loop=0, disposal=1)
+    indexed[0].save(
+        file, "GIF", save_all=True, append_images=indexed[1:], duration=lengths.tolist(), loop=0, disposal=1
+    )
     return file.getvalue()
-
-
-def _save(path: Path, write: Callable[[io.BufferedWriter], object]) -> None:
-    tmp = path.with_name(path.name + ".tmp")
-    with tmp.open("wb") as file:
-        write(file)
-    tmp.replace(path)

@@ -26,20 +26,21 @@ import trimesh
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from hingesplat.articulate import ArticulateConfig, Articulation, articulate
-from hingesplat.capture import Capture, View
+from hingesplat.articulate import ArticulateConfig, Articulation, articulate, draw_repel_points
+from hingesplat.camera import common_up
+from hingesplat.capture import Capture, View, load_cameras
 from hingesplat.capture.images import downsampled
 from hingesplat.errors import HingesplatError
-from hingesplat.export.mjcf import write_mjcf
+from hingesplat.export import export_twin
 from hingesplat.export.splats import write_ply
-from hingesplat.export.urdf import write_urdf
+from hingesplat.files import whole_file, whole_folder, write_json
 from hingesplat.fit import FitConfig, fit
 from hingesplat.fuse import FuseConfig, fuse
 from hingesplat.gaussians import Gaussians, posed
 from hingesplat.joints import JointsConfig, find_joints
 from hingesplat.mesh import MeshConfig, mesh_parts
-from hingesplat.pictures import write_motion_gif, write_summary
-from hingesplat.render import render
+from hingesplat.pictures import movable_share, write_motion_gif, write_summary
+from hingesplat.report import spread_views, write_report, write_views
 from hingesplat.search import Motion
 from hingesplat.segment import Segmentation, SegmentConfig, segment, track
 from hingesplat.stereo import DepthMap, StereoConfig, depth_map, measured, stereo
@@ -54,10 +55,12 @@ MAX_UNEXPLAINED = 0.8
 """Share of what moved that no rigid part explains, above which there is no point in going on."""
 NOISE = 10
 """Seeds, in those of the smallest part, below which nothing need have moved: one state photographed twice had 167."""
+SHOWN_VIEWS = 3
+"""Photographs of each state that the report shows beside the twin."""
 ARTEFACTS = (
     *("config.json", "stages.json", "log.txt", "depth_state*.safetensors", "fit_state*.safetensors", "segmentation.*"),
     *("canonical.safetensors", "articulation.safetensors", "gaussians*.safetensors", "twin.json"),
-    *("parts", "export", "motion.gif", "summary.*", "metrics.json", "*.tmp"),
+    *("parts", "export", "curves.json", "views", "motion.gif", "summary.*", "metrics.json", "report.html", "*.tmp"),
 )
 """Everything that a run folder holds; ``overwrite`` deletes these and nothing else."""
 
@@ -115,6 +118,31 @@ def preset(name: PresetName) -> ReconstructConfig:
     raise HingesplatError(f"preset: unknown {name!r}; use fast, standard or paper")
 
 
+class Curves:
+    """What the stages report on their way, kept as ``{stage or "stage state t": {number: [...]}}``."""
+
+    NUMBERS = ("step", "loss", "psnr", "gaussians")
+
+    def __init__(self, path: Path, report: Report) -> None:
+        self.path, self.pass_on = path, report
+        self.series: dict[str, dict[str, list[float]]] = _read_json(path) if path.is_file() else {}
+
+    def report(self, *, stage: str, state: int | None = None, **numbers: Any) -> None:
+        """Pass on, and take down every step that goes further than the last."""
+        self.pass_on(stage=stage, **({} if state is None else {"state": state}), **numbers)
+        if not numbers:  # The stage begins.
+            self.series = {label: s for label, s in self.series.items() if label.split()[0] != stage}
+        elif all(name in numbers for name in self.NUMBERS):
+            label = stage if state is None else f"{stage} state {state}"
+            series = self.series.setdefault(label, {name: [] for name in self.NUMBERS})
+            if not series["step"] or numbers["step"] > series["step"][-1]:
+                for name, values in series.items():
+                    values.append(round(numbers[name], 5))
+
+    def save(self) -> None:
+        write_json(self.path, self.series)
+
+
 @dataclass(frozen=True)
 class Run:
     """What every stage sees: photographs, what to do with them, and the folder that stages talk through."""
@@ -167,18 +195,19 @@ def reconstruct(
     capture = _capped(capture, config.max_size)
     folder = Path(tempfile.mkdtemp(prefix="hingesplat-")) if out is None else Path(out)
     _open(folder, capture, config, overwrite)
-    run = Run(folder, capture, config, report)
+    curves = Curves(folder / "curves.json", report)
+    run = Run(folder, capture, config, curves.report)
     try:
         with _log_file(folder / "log.txt"), _repeatable():
             log.info("%s to %s", capture.path, folder)
-            _run_stages(run)
+            _run_stages(run, curves)
     finally:
         for leftover in folder.glob("**/*.tmp"):
             shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink(missing_ok=True)
     return Twin.load(run / "twin.json")
 
 
-def _run_stages(run: Run) -> None:
+def _run_stages(run: Run, curves: Curves) -> None:
     finished = _read_json(run / "stages.json") if (run / "stages.json").is_file() else {}
     for name, stage in STAGES.items():
         if name in finished:
@@ -189,10 +218,12 @@ def _run_stages(run: Run) -> None:
         stage(run)
         seconds = time.perf_counter() - started
         finished[name] = {"seconds": round(seconds, 2), "peak_memory_mb": peak_memory_mb()}
+        curves.save()
         write_json(run / "stages.json", finished)
         run.report(stage=name, seconds=seconds)
         log.info("%s: %.1f s", name, seconds)
     _write_summary(run, finished)
+    write_report(run.folder)
 
 
 # The stages, each a function of the run that reads files and writes files.
@@ -305,7 +336,7 @@ def _joints(run: Run) -> None:
 
 
 def _mesh(run: Run) -> None:
-    gaussians, twin = _result(run)
+    gaussians, twin = load_result(run.folder)
     states = [([v.camera for v in views], twin.at_state(t)) for t, views in enumerate(run.views)]
     meshes = mesh_parts(gaussians, states, run.config.mesh)
     parts = []
@@ -322,19 +353,31 @@ def _mesh(run: Run) -> None:
 
 
 def _export(run: Run) -> None:
-    twin = Twin.load(run / "twin.json")
-    meshes = load_meshes(run.folder, twin)
-    with whole_folder(run / "export") as folder:
-        write_urdf(twin, meshes, folder, scale=twin.metres_per_unit)
-        write_mjcf(twin, meshes, folder, scale=twin.metres_per_unit)
+    gaussians, twin = load_result(run.folder)
+    export_twin(twin, load_meshes(run.folder, twin), gaussians, run / "export")
 
 
 def _pictures(run: Run) -> None:
-    gaussians, twin = _result(run)
+    gaussians, twin = load_result(run.folder)
     poses = [twin.at_state(t) for t in range(len(run.capture.states))]
     best = [telling_view(posed(gaussians, T), views) for T, views in zip(poses, run.views, strict=True)]
     write_summary(run / "summary.png", gaussians, list(zip(best, poses, strict=True)))
     write_motion_gif(run / "motion.gif", gaussians, twin, best[-1].camera)
+    _show_views(run)
+
+
+def _show_views(run: Run) -> None:
+    """Photographs for the report: those held back from the reconstruction if every state has some."""
+    states = run.capture.states
+    held_out = all(state.test for state in states)
+    shown = []
+    for t, state in enumerate(states):
+        views = state.test if held_out else state.train
+        gaussians = Gaussians.load(run / f"gaussians_state{t}.safetensors")
+        shown.append((spread_views(views, telling_view(gaussians, views), SHOWN_VIEWS), gaussians))
+    up = common_up([view.camera for views in run.views for view in views])
+    with whole_folder(run / "views") as folder:
+        write_views(folder, shown, up, held_out=held_out)
 
 
 STAGES: dict[str, Callable[[Run], None]] = {
@@ -360,10 +403,6 @@ def _fitted(run: Run, state: int) -> Gaussians:
 def _depth(run: Run, state: int) -> list[DepthMap]:
     known, views = load_file(run / f"depth_state{state}.safetensors"), run.views[state]
     return [depth_map(view, known[str(i)].numpy()) for i, view in enumerate(views)]
-
-
-def _result(run: Run) -> tuple[Gaussians, Twin]:
-    return Gaussians.load(run / "gaussians.safetensors"), Twin.load(run / "twin.json")
 
 
 def _check(config: ReconstructConfig) -> None:
@@ -393,17 +432,51 @@ def coloured(gaussians: Gaussians, offset: Tensor) -> Gaussians:
     return replace(gaussians, sh=sh).detached()
 
 
-@torch.no_grad()
-def telling_view(gaussians: Gaussians, views: Sequence[View], size: int = 64) -> View:
+def telling_view(gaussians: Gaussians, views: Sequence[View]) -> View:
     """The photograph in which the movable parts cover most pixels; the first one if nothing moves."""
+    return max(views, key=lambda view: movable_share(gaussians, view.camera))
 
-    def covered(view: View) -> float:
-        shrink = size / max(view.camera.width, view.camera.height)
-        w, h = (max(1, round(side * shrink)) for side in (view.camera.width, view.camera.height))
-        movable = (gaussians.part > 0).to(gaussians.means)[:, None]
-        return float(render(gaussians, view.camera.scaled(w, h), channels=movable).channels.mean())
 
-    return max(views, key=covered)
+def load_result(folder: Path) -> tuple[Gaussians, Twin]:
+    """The Gaussians, frame of state 0, and the twin of a run.
+
+    Raises:
+        HingesplatError: no such run, one that has not come this far, or something broken.
+    """
+    if not folder.is_dir():
+        raise HingesplatError(f"{folder}: no such run folder")
+    if (folder / "stages.json").is_file() and not (folder / "twin.json").is_file():
+        raise HingesplatError(f"{folder}: its run is not finished; give the same `hingesplat reconstruct` again")
+    twin = Twin.load(folder / "twin.json")
+    return Gaussians.load(folder / "gaussians.safetensors"), twin
+
+
+def capture_of(folder: Path) -> Path | None:
+    """The capture that a run was made from; None where it is gone."""
+    known = _config_of(folder).get("capture")
+    return Path(known) if isinstance(known, str) and Path(known).is_dir() else None
+
+
+def up_of(folder: Path) -> np.ndarray | None:
+    """Up (3,) as the photographs of a run have it; None where these are gone."""
+    capture = capture_of(folder)
+    with suppress(HingesplatError):
+        return None if capture is None else common_up(load_cameras(capture))
+
+
+def repel_points_of(folder: Path) -> np.ndarray:
+    """Repel points (n, 3) as ``articulate`` draws them, where a run used them; else none."""
+    told, path = _config_of(folder).get("articulate", {}), folder / "canonical.safetensors"
+    drawn = None
+    if told.get("repel") and path.is_file():
+        config = ArticulateConfig(repel=True, repel_points=told["repel_points"])
+        drawn = draw_repel_points(Gaussians.load(path), config, torch.Generator().manual_seed(0))
+    return np.zeros((0, 3), np.float32) if drawn is None else drawn.numpy()
+
+
+def _config_of(folder: Path) -> dict[str, Any]:
+    path = folder / "config.json"
+    return _read_json(path) if path.is_file() else {}
 
 
 def load_meshes(folder: Path, twin: Twin) -> dict[int, trimesh.Trimesh]:
@@ -540,29 +613,10 @@ def peak_memory_mb() -> float | None:
     return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)
 
 
-def write_json(path: Path, data: dict[str, Any]) -> None:
-    """Write a JSON file, whole or not at all."""
-    tmp = path.with_name(path.name + ".tmp")
-    tmp.write_text(json.dumps(data, indent=1))
-    tmp.replace(path)
-
-
 def write_tensors(path: Path, tensors: dict[str, Tensor]) -> None:
     """Write a safetensors file, whole or not at all."""
-    tmp = path.with_name(path.name + ".tmp")
-    save_file({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, str(tmp))
-    tmp.replace(path)
-
-
-@contextmanager
-def whole_folder(path: Path) -> Iterator[Path]:
-    """A folder to write into that takes the place of ``path`` when all went well."""
-    tmp = path.with_name(path.name + ".tmp")
-    shutil.rmtree(tmp, ignore_errors=True)
-    tmp.mkdir(parents=True)
-    yield tmp
-    shutil.rmtree(path, ignore_errors=True)
-    tmp.replace(path)
+    with whole_file(path) as tmp:
+        save_file({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, str(tmp))
 
 
 def _read_json(path: Path) -> dict[str, Any]:

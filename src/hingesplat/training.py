@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 
 import numpy as np
 import torch
@@ -16,6 +17,9 @@ from hingesplat.render import Rendering, render
 
 Report = Callable[..., None]
 """Called now and then with ``step, steps, loss, psnr, gaussians``."""
+
+REPORT_EVERY = 50
+"""Steps."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,26 @@ def training_view(view: View, margin: int = 8) -> TrainingView:
     image = torch.cat([rgba[:3] * rgba[3:] + 1 - rgba[3:], rgba[3:]]).contiguous()
     camera = view.camera.cropped(int(x0), int(y0), int(x1 - x0), int(y1 - y0))
     return TrainingView(camera, Target.of(image), image)
+
+
+def averaged(report: Report, steps: int) -> Callable[[Tensor, Tensor, TrainingView, int], None]:
+    """Tell it ``loss, image, view, gaussians`` after each step; it reports after the first and every so many.
+
+    Loss and PSNR are means over the steps since the last report: each saw one photograph, and some are harder.
+    """
+    step, losses, scores = 0, [], []
+
+    def after_step(loss: Tensor, image: Tensor, view: TrainingView, gaussians: int) -> None:
+        nonlocal step
+        losses.append(float(loss.detach()))
+        scores.append(float(psnr(image.detach()[:3], view.image[:3])))
+        step += 1
+        if (step - 1) % REPORT_EVERY == 0 or step == steps:
+            report(step=step, steps=steps, loss=fmean(losses), psnr=fmean(scores), gaussians=gaussians)
+            losses.clear()
+            scores.clear()
+
+    return after_step
 
 
 def four_planes(rendering: Rendering) -> Tensor:

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hingesplat.errors import HingesplatError
+from hingesplat.files import write_json
 
 VERSION = 1
 JointType = Literal["revolute", "prismatic", "fixed"]
@@ -114,9 +115,7 @@ class Twin:
 
     def save(self, path: Path) -> None:
         """Write ``twin.json``, whole or not at all."""
-        tmp = path.with_name(path.name + ".tmp")
-        tmp.write_text(json.dumps(self.to_json(), indent=1))
-        tmp.replace(path)
+        write_json(path, self.to_json())
 
     @staticmethod
     def load(path: Path) -> "Twin":

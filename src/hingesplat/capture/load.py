@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from hingesplat.camera import Camera
 from hingesplat.capture import artgs, colmap, paris, transforms
 from hingesplat.capture.check import check_states
 from hingesplat.capture.frames import Frame, StateFrames
@@ -53,6 +54,11 @@ def load_capture(
             raise HingesplatError(f"{path / state.name}: the masks of all {len(state.train)} views are empty")
     check_states(states, layout)
     return Capture(path, layout, states)
+
+
+def load_cameras(path: Path) -> tuple[Camera, ...]:
+    """The cameras of all training photographs, without decoding these. Raises HingesplatError as ``load_capture``."""
+    return tuple(frame.camera for state in READERS[recognise(path)].read(path) for frame in state.train)
 
 
 def recognise(path: Path) -> str:

@@ -11,6 +11,7 @@ from PIL import Image
 from hingesplat.camera import Camera
 from hingesplat.capture.frames import FLIP_YZ
 from hingesplat.capture.types import View
+from hingesplat.files import whole_file
 
 
 def write_state(folder: Path, views: Sequence[View], split: str) -> Path:
@@ -72,6 +73,5 @@ def _write_png(path: Path, pixels: np.ndarray) -> None:
 
 def _write_whole(path: Path, data: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_bytes(data)
-    temporary.replace(path)
+    with whole_file(path) as tmp:
+        tmp.write_bytes(data)

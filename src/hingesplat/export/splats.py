@@ -1,12 +1,20 @@
-"""The standard 3D Gaussian splatting PLY, as viewers and engines read it."""
+"""Splat files: the standard 3D Gaussian splatting PLY, SPZ and SOG, a file a part and one of the whole."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from hingesplat.errors import HingesplatError
+from hingesplat.export.spz import spz_bytes
+from hingesplat.files import whole_file
 from hingesplat.gaussians import Gaussians
+from hingesplat.render import sh_basis
+from hingesplat.se3 import matrix_to_wxyz, quat_multiply
+
+RUB = np.diag([1.0, -1.0, -1.0])
+"""Turns the axes of splat PLYs (x right, y down, z forward) to those of SPZ (x right, y up, z back)."""
 
 
 def _names(rest: int) -> list[str]:
@@ -16,6 +24,69 @@ def _names(rest: int) -> list[str]:
         + [f"f_rest_{i}" for i in range(rest)]
         + ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     )
+
+
+def transformed(gaussians: Gaussians, R: np.ndarray, factor: float = 1.0) -> Gaussians:
+    """Gaussians turned and scaled about the origin, ``factor · R x``, their harmonics with them."""
+    g = gaussians.detached()
+    turn = torch.as_tensor(R, dtype=torch.float64)
+    directions = torch.nn.functional.normalize(torch.randn(64, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    d, count = directions.double(), g.sh.shape[1]
+    # The turned harmonics say in direction d what the old ones said in Rᵀ d.
+    mix = torch.linalg.lstsq(sh_basis(d, count), sh_basis(d @ turn, count)).solution
+    return replace(
+        g,
+        means=(factor * g.means.double() @ turn.T).to(g.means.dtype),
+        quats=quat_multiply(matrix_to_wxyz(turn).to(g.quats.dtype).expand_as(g.quats), g.quats),
+        log_scales=g.log_scales + float(np.log(factor)),
+        sh=torch.einsum("ab,nbc->nac", mix.to(g.sh.dtype), g.sh),
+    )
+
+
+def write_splats(gaussians: Gaussians, names: dict[int, str], out: Path, form: str) -> np.ndarray:
+    """Write ``out/twin.FORM`` and ``out/NAME.FORM``, a file a part, in state 0.
+
+    PLY and SOG keep the coordinates given; the axes of SPZ are those that its viewers expect.
+
+    Args:
+        gaussians: in the export's frame.
+        names: of the parts, by part id; parts without Gaussians get no file.
+        out: an existing folder.
+        form: ply, spz or sog.
+
+    Returns:
+        T_mesh_file (4, 4): takes coordinates in the files to those given.
+
+    Raises:
+        HingesplatError: gaussforge, which writes SOG, is absent or fails.
+    """
+    T_mesh_file = np.eye(4)
+    g = gaussians.detached()
+    if form == "spz":
+        g, T_mesh_file[:3, :3] = transformed(g, RUB), RUB.T
+    files = {"twin": g} | {name: g[g.part == i] for i, name in names.items()}
+    for name, part in files.items():
+        path = out / f"{name}.{form}"
+        if len(part) and form == "spz":
+            path.write_bytes(spz_bytes(part))
+        elif len(part):
+            write_ply(part, path.with_suffix(".ply"))
+            if form == "sog":
+                _to_sog(path.with_suffix(".ply"), path)
+    return T_mesh_file
+
+
+def _to_sog(source: Path, target: Path) -> None:
+    """A PLY to SOG; the PLY goes."""
+    try:
+        from gaussforge import GaussForge
+    except ImportError as e:
+        raise HingesplatError("sog: needs the package gaussforge; pip install 'hingesplat[splats]'") from e
+    made = GaussForge().convert(source.read_bytes(), "ply", "sog")
+    source.unlink()
+    if "error" in made:
+        raise HingesplatError(f"{target}: cannot be made: {made['error']}; export PLY instead")
+    target.write_bytes(made["data"])
 
 
 def write_ply(gaussians: Gaussians, path: Path) -> None:
@@ -32,9 +103,8 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
     table = torch.cat([c.cpu().float() for c in columns], 1).numpy().astype("<f4")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
     header += [f"property float {name}" for name in _names(rest.shape[1])]
-    tmp = path.with_name(path.name + ".tmp")
-    tmp.write_bytes(("\n".join([*header, "end_header"]) + "\n").encode() + table.tobytes())
-    tmp.replace(path)
+    with whole_file(path) as tmp:
+        tmp.write_bytes(("\n".join([*header, "end_header"]) + "\n").encode() + table.tobytes())
 
 
 def read_ply(path: Path) -> Gaussians:

@@ -2,36 +2,23 @@
 
 from pathlib import Path
 
-import trimesh
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
-from hingesplat.export.links import Link, axis_load, build_links, numbers, servo_gain, write_text
-from hingesplat.twin import Twin
+from hingesplat.export.links import Link, joint_dynamics, numbers, write_meshes
+from hingesplat.files import write_text
 
 
-def write_urdf(
-    twin: Twin, meshes: dict[int, trimesh.Trimesh], out: Path, *, density: float = 500.0, scale: float = 1.0
-) -> Path:
+def write_urdf(links: list[Link], out: Path) -> Path:
     """Write ``out/twin.urdf`` with ``out/meshes/`` and ``out/collision/``; paths inside are relative.
 
-    Joint value 0 is state 0; limits are the twin's. URDF cannot exempt a part from touching the base it is
-    hinged to, so a ``<mujoco>`` tag, which other programs ignore, switches contacts off in MuJoCo; use the
-    MJCF to grasp and push there.
-
-    Args:
-        twin: parts and joints, frame of state 0.
-        meshes: closed part meshes by part id, frame of state 0, scene units.
-        out: the folder; made if absent.
-        density: kg/m³.
-        scale: metres per scene unit.
+    Joint value 0 is state 0. URDF cannot exempt a part from touching the base it is hinged to, so a
+    ``<mujoco>`` tag, which other programs ignore, switches contacts off in MuJoCo; use the MJCF to grasp and
+    push there.
 
     Returns:
         The URDF's path.
-
-    Raises:
-        HingesplatError: the joints do not form a tree.
     """
-    links = build_links(twin, meshes, out, density=density, scale=scale)
+    write_meshes(links, out)
     robot = etree.Element("robot", name="twin")
     mujoco = etree.SubElement(robot, "mujoco")
     etree.SubElement(mujoco, "compiler", strippath="false", discardvisual="false", fusestatic="false")
@@ -55,10 +42,8 @@ def _add_link(robot: etree._Element, link: Link) -> None:
     etree.SubElement(inertial, "inertia", **{k: numbers(v) for k, v in moments.items()})
     if link.mesh is None:
         return
-    visual = etree.SubElement(element, "visual", name=f"{link.name}_visual")
-    _add_mesh(visual, f"meshes/{link.name}.obj")
-    material = etree.SubElement(visual, "material", name=f"{link.name}_colour")
-    etree.SubElement(material, "color", rgba=numbers([*link.colour, 1]))
+    # Without a material of its own, so that the mesh's texture shows: PyBullet would multiply the two.
+    _add_mesh(etree.SubElement(element, "visual", name=f"{link.name}_visual"), f"meshes/{link.name}.obj")
     for i in range(len(link.hulls)):
         collision = etree.SubElement(element, "collision", name=f"{link.name}_collision_{i}")
         _add_mesh(collision, f"collision/{link.name}_{i}.obj")
@@ -78,16 +63,9 @@ def _add_joint(robot: etree._Element, link: Link, parent: Link, links: list[Link
     if link.joint is None or not link.moves:
         return
     etree.SubElement(element, "axis", xyz=numbers(link.joint.axis))
-    lower, upper = link.limits
-    load, _ = axis_load(link, links)
-    span = max(upper - lower, 1e-4)
+    dynamics = {k: numbers(v) for k, v in joint_dynamics(link, links).items()}
+    lower, upper = (numbers(v) for v in link.limits)
     etree.SubElement(
-        element,
-        "limit",
-        lower=numbers(lower),
-        upper=numbers(lower + span),
-        # Twice what the servo asks for over the whole range; end to end in half a second.
-        effort=numbers(2 * servo_gain(link, links) * span),
-        velocity=numbers(2 * span),
+        element, "limit", lower=lower, upper=upper, effort=dynamics["effort"], velocity=dynamics["velocity"]
     )
-    etree.SubElement(element, "dynamics", damping=numbers(2 * load), friction=numbers(0.1 * load))
+    etree.SubElement(element, "dynamics", damping=dynamics["damping"], friction=dynamics["friction"])

@@ -1,7 +1,7 @@
 """A run beside the truth: every number of the field, in ``RUN/metrics.json``."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 
 from hingesplat.errors import HingesplatError
+from hingesplat.files import write_text
 from hingesplat.metrics.motion import joint_errors
 from hingesplat.metrics.surface import SAMPLES, chamfer, clean, match, overlap, penetration, sample
 from hingesplat.metrics.truth import Truth, load_mesh, load_truth
@@ -21,6 +22,7 @@ MATCH_SAMPLES = 4000
 MATCH_RADIUS = 0.02
 """Of the object's extent: points nearer than this are the same surface."""
 STEPS = 11
+NO_SIMULATION = {"simulation": None, "simulation_why_null": "not asked for"}
 NO_LPIPS = "the weights of its network do not come with this package"
 
 
@@ -33,12 +35,13 @@ class FoundPart:
     """Cleaned, world frame, one a state."""
 
 
-def evaluate(run: Path, truth: Path) -> dict[str, Any]:
+def evaluate(run: Path, truth: Path, simulation: Mapping[str, Any] = NO_SIMULATION) -> dict[str, Any]:
     """Compare the twin in the folder ``run`` with the truth and write ``run/metrics.json``.
 
     Parts are counted with the base. Chamfer distances are squared, the sum of both directions, ×1000, of
     10 000 points a surface: means over both states and three draws of points. Where the photographs or the
-    Gaussians are not there, ``views`` holds nulls and ``why_null``.
+    Gaussians are not there, ``views`` holds nulls and ``why_null``. ``simulation`` is what
+    ``hingesplat.export.check.simulation`` gives and goes to the file as it is.
 
     Returns:
         What it wrote.
@@ -66,12 +69,11 @@ def evaluate(run: Path, truth: Path) -> dict[str, Any]:
         "penetration": _penetrations(twin, found),
         "views": views,
         **part_iou,
+        **simulation,
         "mesh_cleaning": "components below 10 % of the largest one's area dropped",
         "truth": str(truth),
     }
-    tmp = run / "metrics.json.tmp"
-    tmp.write_text(json.dumps(metrics, indent=1, allow_nan=False))
-    tmp.replace(run / "metrics.json")
+    write_text(run / "metrics.json", json.dumps(metrics, indent=1, allow_nan=False))
     return metrics
 
 

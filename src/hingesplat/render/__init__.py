@@ -120,11 +120,11 @@ def sh_to_rgb(sh: Tensor, directions: Tensor) -> Tensor:
     Raises:
         ValueError: another number of coefficients.
     """
-    basis = _sh_basis(directions, sh.shape[1])
+    basis = sh_basis(directions, sh.shape[1])
     return (0.5 + torch.einsum("nb,nbc->nc", basis, sh)).clamp(min=0)
 
 
-def _sh_basis(directions: Tensor, count: int) -> Tensor:
+def sh_basis(directions: Tensor, count: int) -> Tensor:
     """The first ``count`` real spherical harmonics, (n, count)."""
     if count not in (1, 4, 9, 16):
         raise ValueError(f"sh: expected 1, 4, 9 or 16 coefficients (degree 0 to 3), got {count}")

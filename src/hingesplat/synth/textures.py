@@ -5,6 +5,7 @@ number of the face, which shifts and tints it, so that no two faces look alike.
 """
 
 import numpy as np
+from numba import njit
 
 from hingesplat.synth.shapes import Texture
 
@@ -26,15 +27,37 @@ def _hash(i: np.ndarray, j: np.ndarray, k: np.ndarray, seed: int) -> np.ndarray:
 
 def noise(x: np.ndarray, seed: int) -> np.ndarray:
     """Value noise in [0, 1] with cells of size 1: trilinear between hashed lattice values, (n, 3) to (n,)."""
-    floor = np.floor(x)
-    f = (x - floor).astype(np.float32)
-    f = f * f * (3 - 2 * f)
-    i = floor.astype(np.int32)
-    total = np.zeros(len(x), np.float32)
-    for corner in np.ndindex(2, 2, 2):
-        weight = np.prod(np.where(np.asarray(corner, bool), f, 1 - f), axis=1)
-        total += weight * _hash(i[:, 0] + corner[0], i[:, 1] + corner[1], i[:, 2] + corner[2], seed)
-    return total
+    out = np.empty(len(x), np.float32)
+    _noise(np.ascontiguousarray(x, np.float64), np.uint32((seed * 0x9E3779B1) & 0xFFFFFFFF), out)
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _noise(x: np.ndarray, salt: np.uint32, out: np.ndarray) -> None:
+    for n in range(len(x)):
+        total = np.float32(0)
+        c0, c1, c2 = np.floor(x[n, 0]), np.floor(x[n, 1]), np.floor(x[n, 2])
+        f0, f1, f2 = _smooth(x[n, 0] - c0), _smooth(x[n, 1] - c1), _smooth(x[n, 2] - c2)
+        for a in range(2):
+            for b in range(2):
+                for c in range(2):
+                    h = np.uint32(np.uint32(np.int64(c0) + a) * np.uint32(0x8DA6B343))
+                    h ^= np.uint32(np.uint32(np.int64(c1) + b) * np.uint32(0xD8163841))
+                    h ^= np.uint32(np.uint32(np.int64(c2) + c) * np.uint32(0xCB1AB31F))
+                    h = np.uint32(h ^ salt)
+                    h = np.uint32(np.uint32(h ^ (h >> 15)) * np.uint32(0x2C1B3C6D))
+                    h = np.uint32(np.uint32(h ^ (h >> 12)) * np.uint32(0x297A2D39))
+                    h = np.uint32(h ^ (h >> 15))
+                    w = (f0 if a else np.float32(1) - f0) * (f1 if b else np.float32(1) - f1)
+                    w *= f2 if c else np.float32(1) - f2
+                    total += w * (np.float32(h >> 8) * np.float32(2**-24))
+        out[n] = total
+
+
+@njit(cache=True, inline="always")
+def _smooth(t: float) -> np.float32:
+    f = np.float32(t)
+    return f * f * (np.float32(3) - np.float32(2) * f)
 
 
 def fractal(x: np.ndarray, seed: int, octaves: int = 3) -> np.ndarray:
@@ -92,6 +115,51 @@ def speckle(base: Colour, spots: Colour, size: float, seed: int, cover: float = 
         slow = fractal(p * 0.12, seed + 7, 2)
         hue = noise(p * 0.2, seed + 13)[:, None] * np.array([0.10, -0.03, -0.10])
         return np.clip(_mix(base, spots, flecks) * (0.7 + 0.6 * slow)[:, None] + hue - hue.mean(0), 0, 1)
+
+    return texture
+
+
+def plain(colour: Colour, seed: int, depth: float = 0.08, size: float = 0.1) -> Texture:
+    """Paint that is nearly one colour: slow changes of brightness by ``depth``."""
+
+    def texture(x: np.ndarray, face: int) -> np.ndarray:
+        slow = fractal(_own(x, face) / size, seed, 2)
+        return np.clip(np.asarray(colour) * (1 + depth * (2 * slow - 1))[:, None], 0, 1)
+
+    return texture
+
+
+def brushed(colour: Colour, axis: int, seed: int, depth: float = 0.12, size: float = 0.004) -> Texture:
+    """Metal with fine scratches along ``axis``."""
+    stretch = np.full(3, 1.0)
+    stretch[axis] = 0.03
+
+    def texture(x: np.ndarray, face: int) -> np.ndarray:
+        p = _own(x, face)
+        streaks = 0.7 * fractal(p * stretch / size, seed, 2) + 0.3 * noise(p / (20 * size), seed + 9)
+        return np.clip(np.asarray(colour) * (1 + depth * (2 * streaks - 1))[:, None], 0, 1)
+
+    return texture
+
+
+def stripes(a: Texture, b: Texture, axis: int, period: float, share: float = 0.5, start: float = 0.0) -> Texture:
+    """``b`` on ``share`` of every ``period`` along ``axis`` from ``start`` on, ``a`` on the rest."""
+
+    def texture(x: np.ndarray, face: int) -> np.ndarray:
+        second = ((x[:, axis] - start) / period) % 1 < share
+        return np.where(second[:, None], b(x, face), a(x, face))
+
+    return texture
+
+
+def inlay(outer: Texture, inner: Texture, margin: float) -> Texture:
+    """``inner`` on every face but for a frame of ``outer``, ``margin`` wide."""
+
+    def texture(x: np.ndarray, face: int) -> np.ndarray:
+        low, high = x.min(0), x.max(0)
+        wide = high - low > 2 * margin
+        within = ((x > low + margin) & (x < high - margin) | ~wide).all(1) & (wide.sum() > 1)
+        return np.where(within[:, None], inner(x, face), outer(x, face))
 
     return texture
 

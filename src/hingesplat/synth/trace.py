@@ -1,7 +1,8 @@
 """Ray-traced pictures of a model: light is traced once a state into texels, and pictures look it up.
 
-Every surface is matt, so what leaves a texel is the same in all directions and can be kept. Light comes
-from suns and a sky dome that stay fixed in the world; shading and cast shadows thus change with the motion.
+What a matt surface sends out is the same in all directions and can be kept with the texel; the clear coat of a
+glossy one is added picture by picture. Light comes from suns and a sky dome that stay fixed in the world;
+shading, cast shadows and highlights thus change with the motion.
 """
 
 from dataclasses import dataclass
@@ -13,13 +14,18 @@ from embreex.rtcore_scene import EmbreeScene
 from scipy.ndimage import gaussian_filter, zoom
 
 from hingesplat.camera import Camera
-from hingesplat.synth.objects import Model
+from hingesplat.synth.model import Model
 from hingesplat.synth.shapes import Patch
 
 SAMPLES = 3  # A side: 3 × 3 rays a pixel.
 LIGHT_STEP = 2  # Light is traced on every second texel each way; it is smoother than the textures.
 AMBIENT = 0.14  # Of full light, everywhere: what bounces between surfaces.
 GAMMA = 2.2
+SUNS = 3
+SKY = np.array([0.95, 1.0, 1.08], np.float32)
+SHININESS = 60.0  # Of Blinn's highlight; cosines below GLINT leave nothing of it.
+GLINT = 0.92
+F0 = 0.05  # A clear coat reflects so much of what meets it head-on.
 
 
 def _lights() -> tuple[np.ndarray, np.ndarray]:
@@ -54,7 +60,7 @@ class Surface:
     def __init__(self, model: Model, texel: float) -> None:
         """``texel`` is the edge of a texel in model units."""
         self.model = model
-        vertices, coords, faces, patch_of, body_of, albedo = [], [], [], [], [], []
+        vertices, coords, faces, patch_of, body_of, albedo, normals, gloss = [], [], [], [], [], [], [], []
         self.texels: list[Texels] = []
         n_vertices = offset = 0
         for number, body in enumerate(model.bodies):
@@ -65,6 +71,8 @@ class Surface:
                 s, t = _grid(patch, light_shape)
                 self.texels.append(Texels(body.name, shape, offset, light_shape, patch.at(s, t), patch.normals(s, t)))
                 albedo.append(patch.texture(patch.at(*_grid(patch, shape)), patch.face))
+                normals.append(patch.normals(st[:, 0], st[:, 1]))
+                gloss.append(patch.gloss)
                 vertices.append(v)
                 coords.append(st / np.asarray(patch.size) * shape)
                 faces.append(f + n_vertices)
@@ -75,6 +83,7 @@ class Surface:
         self.vertices, self.faces = np.concatenate(vertices), np.concatenate(faces)
         self.corner_texel = np.concatenate(coords)[self.faces].astype(np.float32)  # (triangles, 3, 2)
         self.patch_of, self.body_of_vertex = np.concatenate(patch_of), np.concatenate(body_of)
+        self.normals, self.gloss = np.concatenate(normals), np.array(gloss, np.float32)
         self.albedo = np.clip(np.concatenate(albedo), 0.01, 1) ** GAMMA
 
 
@@ -91,6 +100,9 @@ class LitScene:
         self.surface, self.poses = surface, poses
         per_body = np.stack([poses[b.name] for b in surface.model.bodies])[surface.body_of_vertex]
         self.vertices = (per_body[:, :3, :3] @ surface.vertices[:, :, None])[..., 0] + per_body[:, :3, 3]
+        self.shift = 1e-3 * float(np.ptp(self.vertices, axis=0).max())  # Rays start so far off the surface.
+        normals = (per_body[:, :3, :3] @ surface.normals[:, :, None])[..., 0]
+        self.corner_normal = normals[surface.faces].astype(np.float32)
         self.device = EmbreeDevice()
         self.scene = EmbreeScene(self.device)
         TriangleMesh(self.scene, self.vertices.astype(np.float32), surface.faces.astype(np.int32))
@@ -102,12 +114,11 @@ class LitScene:
     def _light(self) -> np.ndarray:
         """sRGB bytes leaving every texel, (texels, 3) float32 in 0–255."""
         directions, colours = _lights()
-        shift = 1e-3 * float(np.ptp(self.vertices, axis=0).max())
         points, normals = [], []
         for texels in self.surface.texels:
             T = self.poses[texels.body]
             n = texels.normals @ T[:3, :3].T
-            points.append(texels.points @ T[:3, :3].T + T[:3, 3] + shift * n)
+            points.append(texels.points @ T[:3, :3].T + T[:3, 3] + self.shift * n)
             normals.append(n)
         x, n = np.concatenate(points).astype(np.float32), np.concatenate(normals)
         light = np.full(x.shape, AMBIENT)
@@ -149,6 +160,12 @@ class LitScene:
         rgba = np.zeros((len(d), 4), np.float32)
         rgba[found, :3] = self.colours[self.offsets[patch] + ij[:, 0] * self.shapes[patch, 1] + ij[:, 1]]
         rgba[found, 3] = 255
+        if (coat := np.flatnonzero(self.surface.gloss[patch])).size:
+            here, (u, v) = found[coat], (u[coat], v[coat])
+            x = origin.astype(np.float32) + d[here] * hit["tfar"][here, None]
+            shine = self._shine(x, d[here], face[coat], np.concatenate([1 - u - v, u, v], 1))
+            under = (rgba[here, :3] / 255) ** GAMMA + shine * self.surface.gloss[patch[coat], None]
+            rgba[here, :3] = 255 * np.clip(under, 0, 1) ** (1 / GAMMA)
         # One raw array for what only the pixel's centre tells: z-depth and body.
         centre = np.zeros((len(d), 2), np.float32)
         centre[found, 0] = hit["tfar"][found] * (d[found] @ camera.T_world_camera[:3, 2])
@@ -162,6 +179,29 @@ class LitScene:
         m = SAMPLES // 2
         middle[y0 : y0 + h, x0 : x0 + w] = centre.reshape(h, SAMPLES, w, SAMPLES, 2)[:, m, :, m]
         return picture, middle[..., 0], middle[..., 1].astype(np.uint8)
+
+    def _shine(self, x: np.ndarray, towards: np.ndarray, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
+        """What a clear coat at the points (n, 3) adds, seen along the rays ``towards`` them: suns, and the sky.
+
+        Linear RGB (n, 3). Bodies of the object darken the sky, but are not mirrored. All float32.
+        """
+        n = np.einsum("nk,nki->ni", bary, self.corner_normal[face])
+        n /= np.sqrt(np.einsum("ni,ni->n", n, n))[:, None]
+        facing = np.clip(-np.einsum("ni,ni->n", n, towards), 0, 1)
+        mirrored = towards + 2 * facing[:, None] * n
+        start = x + 2 * self.shift * n
+        out = np.zeros_like(x)
+        sky = np.clip(0.35 + 0.65 * mirrored[:, 2], 0.1, 1) * (F0 + (1 - F0) * (1 - facing) ** 5)
+        free = self.scene.run(start, mirrored, query="OCCLUDED") < 0
+        out[free] = sky[free, None] * SKY
+        for sun, colour in zip(*(a[:SUNS].astype(np.float32) for a in _lights()), strict=True):
+            half = sun - towards
+            cosine = np.einsum("ni,ni->n", n, half) / np.sqrt(np.einsum("ni,ni->n", half, half))
+            lit = np.flatnonzero((cosine > GLINT) & (n @ sun > 0))
+            rays = np.broadcast_to(sun, (len(lit), 3)).copy()
+            lit = lit[self.scene.run(start[lit], rays, query="OCCLUDED") < 0]
+            out[lit] += 0.6 * cosine[lit, None] ** SHININESS * colour
+        return out
 
     def _window(self, camera: Camera) -> tuple[int, int, int, int]:
         """Pixels (x0, y0, width, height) that the object can touch; the whole picture if it is very near."""
