@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import KDTree
 
 from hingesplat.camera import Camera
 from hingesplat.capture import View
@@ -156,3 +157,65 @@ def angle_between(T: np.ndarray, T_true: np.ndarray) -> float:
     """Degrees from one motion (4, 4) to another."""
     R = T[:3, :3].T @ T_true[:3, :3]
     return float(np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1))))
+
+
+def nearest(points: np.ndarray, gaussians: Gaussians) -> np.ndarray:
+    """(n,) index of the Gaussian next to each of points (n, 3)."""
+    return np.asarray(KDTree(gaussians.means.numpy()).query(points)[1])
+
+
+BOARDS = np.array(
+    [
+        [[-0.5, -0.4, -0.4], [0.5, 0.4, -0.32]],
+        [[-0.5, -0.4, -0.4], [-0.42, 0.4, 0.4]],
+        [[0.42, -0.4, -0.4], [0.5, 0.4, 0.4]],
+        [[-0.5, -0.4, -0.4], [0.5, -0.32, 0.4]],
+        [[-0.5, 0.32, -0.4], [0.5, 0.4, 0.4]],
+    ]
+)
+"""(5, 2, 3) lower and upper corners of the boards of an open box: the visual hull has a lid on it."""
+
+
+def off_boards(points: np.ndarray) -> np.ndarray:
+    """Distance of points (n, 3) from the surface of the nearest board."""
+    outside = [np.maximum(low - points, points - high) for low, high in BOARDS]
+    return np.min([np.linalg.norm(q.clip(0), axis=1) + np.abs(q.max(1).clip(max=0)) for q in outside], 0)
+
+
+def in_the_hollow(points: np.ndarray) -> np.ndarray:
+    """(n,) bool: on the inner faces of the open box or between them, clear of its opening."""
+    return (np.abs(points) < [0.44, 0.34, 0.35]).all(1)
+
+
+def boards_depth(camera: Camera) -> np.ndarray:
+    """(h, w) exact depth of the open box at the pixels' centres; 0 beside it."""
+    origin, d = camera.rays()
+    d = d / (d @ camera.T_world_camera[:3, 2])[..., None]
+    nearest = np.full(d.shape[:2], np.inf)
+    for corners in BOARDS:
+        slabs = (corners[:, None, None] - origin) / d
+        enter, leave = slabs.min(0).max(-1), slabs.max(0).min(-1)
+        nearest = np.where(enter < leave, np.minimum(nearest, enter), nearest)
+    return np.where(np.isfinite(nearest), nearest, 0)
+
+
+@cache
+def open_box(size: int, grey: bool = False) -> tuple[View, ...]:
+    """Ray-traced photographs of the open box with their depth, from 24 sides, most of them above."""
+    k = (np.arange(24) + 0.5) / 24
+    z, turn = 0.95 - 1.3 * k**2, 24 * np.pi * (1 + 5**0.5) * k
+    r = np.sqrt(1 - z**2)
+    eyes = 2.6 * np.column_stack([r * np.cos(turn), r * np.sin(turn), z])
+    return tuple(_traced(look_at(eye, size), grey) for eye in eyes)
+
+
+def _traced(camera: Camera, grey: bool) -> View:
+    fine = camera.scaled(2 * camera.width, 2 * camera.height)
+    depth = boards_depth(fine)
+    y, x = np.nonzero(depth)
+    rgba = np.zeros((*depth.shape, 4))
+    rgba[y, x, :3] = 0.5 if grey else texture(2 * fine.lifted(x, y, depth[y, x]), 1)
+    rgba[y, x, 3] = 1
+    rgba = rgba.reshape(camera.height, 2, camera.width, 2, 4).mean((1, 3))
+    rgba[..., :3] /= rgba[..., 3:].clip(1e-6)
+    return View(camera, np.round(255 * rgba).astype(np.uint8), "open box", boards_depth(camera).astype(np.float32))

@@ -330,6 +330,20 @@ def test_colmap_images_need_a_folder_for_the_state(tmp_path):
 # Downsampling.
 
 
+def test_lifted_undoes_project() -> None:
+    camera = ring(3)[2].cropped(3, 5, 40, 30)
+    rng = np.random.default_rng(0)
+    x, y, depth = rng.integers(0, 40, 100), rng.integers(0, 30, 100), rng.uniform(0.5, 4, 100)
+    points = camera.lifted(x, y, depth)
+    uv, z = camera.project(points)
+    np.testing.assert_allclose(uv, np.column_stack([x, y]) + 0.5, atol=1e-9)  # The pixels' centres.
+    np.testing.assert_allclose(z, depth)
+    origin, d = camera.rays()
+    along = points - origin
+    np.testing.assert_allclose(along / np.linalg.norm(along, axis=1, keepdims=True), d[y, x], atol=1e-9)
+    assert camera.lifted(x[:0], y[:0], depth[:0]).shape == (0, 3)
+
+
 def test_downsampling_keeps_projections_and_colours(tmp_path):
     view = views("start", size=(96, 80), focal=110.0)[0]
     small = downsampled(view, 36)

@@ -219,10 +219,13 @@ def test_a_bug_leaves_its_traceback_in_the_log(stage, capture: Path, tmp_path: P
 
 def test_options_of_stages_start_from_the_preset() -> None:
     args = ["reconstruct", "photos", "--out", "twin", "--preset", "fast", "--fit.steps", "7", "--parts", "3"]
+    args += ["--depth", "--stereo.planes", "50"]
     command = cli.parse(args)
     assert isinstance(command, cli.Reconstruct)
     fast = preset("fast")
-    assert command.config == replace(fast, parts=3, fit=replace(fast.fit, steps=7))
+    assert command.config == replace(
+        fast, parts=3, depth=True, fit=replace(fast.fit, steps=7), stereo=replace(fast.stereo, planes=50)
+    )
     plain = cli.parse(args[:4])
     assert isinstance(plain, cli.Reconstruct) and plain.config == ReconstructConfig()
 
@@ -267,12 +270,15 @@ def test_metrics_table_shows_what_was_missed(capfd) -> None:
 def test_progress_shows_step_loss_and_time(capfd) -> None:
     console = cli.Console(force_terminal=True, width=120)
     with cli.StageProgress(console) as report:
+        report(stage="stereo")
+        report(stage="stereo", state=0, step=1, steps=2)
         report(stage="fit")
         report(stage="fit", state=0, step=50, steps=100, loss=0.125, psnr=31.26, gaussians=900)
         report(stage="fit", state=1, step=1, steps=100, loss=0.5, psnr=20.0, gaussians=800)
         report(stage="fit", seconds=2.0)
         report(stage="mesh")
     out = capfd.readouterr().out
+    assert "stereo state 0" in out and "1/2" in out
     for text in ("fit state 0", "50/100", "loss 0.1250", "31.3 dB", "900 Gaussians", "fit state 1", "mesh"):
         assert text in out, text
 

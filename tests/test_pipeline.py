@@ -18,6 +18,7 @@ from hingesplat.metrics import evaluate
 from hingesplat.pipeline import ReconstructConfig, Run, initial_transforms, preset, reconstruct
 from hingesplat.search import Motion
 from hingesplat.segment import Segmentation
+from hingesplat.stereo import StereoConfig
 from hingesplat.synth import make
 from hingesplat.twin import Part, Twin
 
@@ -123,11 +124,13 @@ def test_a_run_is_bound_to_its_capture_and_config(toy: Toy, capture: Capture, tm
     assert toy.calls == ["first", "second", "third"]
 
     (out / "notes.txt").write_text("mine")
-    (out / "metrics.json").write_text("{}")
+    for name in ("metrics.json", "depth_state0.safetensors"):
+        (out / name).write_text("{}")
     reconstruct(capture, config, out=out, overwrite=True)
     assert len(toy.calls) == 6
     assert json.loads((out / "config.json").read_text())["seed"] == 3
     assert (out / "notes.txt").is_file() and not (out / "metrics.json").exists()
+    assert not (out / "depth_state0.safetensors").exists()
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
@@ -224,23 +227,42 @@ def test_motion_that_is_none_or_not_rigid(capture, tmp_path, caplog, motions, un
     assert ("no motion found between state 0 and state 1" in caplog.text) == (outcome == "static")
 
 
-def test_depth_points_lie_on_what_the_depth_shows(cabinet: Path) -> None:
+def test_depth_is_found_by_stereo_or_taken_as_measured(cabinet: Path, tmp_path: Path) -> None:
     deep = load_capture(cabinet, with_depth=True)
-    points = pipeline.depth_points(deep.states[0].train, 500, seed=0)
-    assert points is not None and points.shape == (500, 3)
-    for view in deep.states[0].train[:3]:
+    small = StereoConfig(image_size=64, planes=64)
+    maps = {}
+    for depth in (False, True):
+        (tmp_path / str(depth)).mkdir()
+        run = Run(tmp_path / str(depth), deep, ReconstructConfig(depth=depth, stereo=small), lambda **_: None)
+        pipeline._stereo(run)
+        maps[depth] = pipeline._depth(run, 1)
+    assert len(maps[False]) == len(maps[True]) == len(deep.states[1].train)
+    assert {m.depth.shape for m in maps[False] + maps[True]} == {(64, 64)}
+    found, known = (np.stack([m.depth for m in maps[depth]]) for depth in (False, True))
+    on_object = np.stack([v.rgba[..., 3] for v in deep.states[1].train])[:, ::2, ::2] > 128
+    assert (known > 0)[on_object].mean() > 0.9 and (found > 0)[on_object].mean() > 0.3
+    both = (found > 0) & (known > 0)
+    assert np.median(np.abs(found - known)[both]) < 0.02
+    for view in deep.states[1].train[:3]:
+        points = maps[True][7].points()[0]
         uv, z = view.camera.project(points)
         u, v = np.floor(uv).astype(int).T
         assert view.depth is not None
         there = view.depth[v.clip(0, 127), u.clip(0, 127)]
         assert np.mean(z > there - 0.05) > 0.9  # On the surface or behind it, not in front.
-    assert pipeline.depth_points(load_capture(cabinet).states[0].train, 500, seed=0) is None
+
+
+def test_a_capture_without_depth_pictures_has_none_measured(capture: Capture, tmp_path: Path) -> None:
+    run = Run(tmp_path, capture, ReconstructConfig(depth=True), lambda **_: None)
+    pipeline._stereo(run)
+    assert all((m.depth == 0).all() for t in (0, 1) for m in pipeline._depth(run, t))
 
 
 def small_config() -> ReconstructConfig:
     config = ReconstructConfig()
     return replace(
         config,
+        stereo=replace(config.stereo, planes=64),
         fit=replace(config.fit, steps=600, start_gaussians=2500, max_gaussians=4500),
         articulate=replace(config.articulate, steps=1000),
         joints=replace(config.joints, steps=150, uncertainty_views=4),
@@ -291,7 +313,8 @@ def test_curves_go_on_where_a_run_goes_on(tmp_path: Path) -> None:
     def step(n: int) -> dict:
         return {"stage": "fit", "state": 0, "step": n, "steps": 9, "loss": 1.0 / n, "psnr": 3.0 * n, "gaussians": 7}
 
-    for event in ({"stage": "fit"}, step(1), step(5), step(9), step(2), {"stage": "fit", "seconds": 1.5}):
+    events = [{"stage": "fit"}, step(1), step(5), step(9), step(2), {"stage": "fit", "seconds": 1.5}]
+    for event in events:
         curves.report(**event)
     assert len(heard) == 6 and heard[1] == step(1) and heard[-1] == {"stage": "fit", "seconds": 1.5}
     curves.save()

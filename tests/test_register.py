@@ -87,6 +87,33 @@ def test_texture_holds_a_plane_that_could_slide() -> None:
     assert np.linalg.norm(T[:2, 3]) < 0.002
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_panel_comes_to_lie_on_the_side_it_shows(side: float) -> None:
+    """Grey, and it starts on the wrong side: only normals tell the two sheets of a thin panel apart."""
+    rng = np.random.default_rng(8)
+    thickness = 0.02
+    front, back = plane(4000, rng), plane(4000, rng)
+    target = Sheet(
+        np.concatenate([front.points, back.points - [0, 0, thickness]]),
+        np.concatenate([front.normals, -back.normals]),
+        np.concatenate([front.colours, back.colours]),
+    )
+    seen = plane(400, rng)
+    source = Sheet(seen.points, side * seen.normals, seen.colours)
+    right, wrong = (0.0, -thickness) if side > 0 else (-thickness, 0.0)
+    start = np.eye(4)
+    start[2, 3] = wrong
+    T = register(source, target, start, 1.0)
+    assert np.abs(source.points @ T[2, :3] + T[2, 3] - right).max() < 1e-3
+
+
+def test_features_turn_with_the_sheet() -> None:
+    sheet_ = corner(50, np.random.default_rng(9))
+    T = revolute([1.0, 2.0, 0.5], [0.3, 0, 0], 0.8)
+    moved = Sheet(sheet_.points @ T[:3, :3].T + T[:3, 3], sheet_.normals @ T[:3, :3].T, sheet_.colours)
+    np.testing.assert_allclose(sheet_.features(T, 2.0), moved.features(np.eye(4), 2.0), atol=1e-12)
+
+
 def test_too_few_pairs_leave_the_motion_alone() -> None:
     rng = np.random.default_rng(5)
     target = corner(300, rng)

@@ -8,14 +8,14 @@ import pytest
 from hingesplat.gaussians import SH_C0
 from hingesplat.screw import prismatic, revolute
 from hingesplat.search import HIDDEN_SCORE, Motion, ScoreVolume, both_signs, novelty, scan, score_volume
-from hingesplat.segment import Surface, bounds, on_surface
-from hingesplat.visibility import look
+from hingesplat.surface import Surface, bounds, surface_of
 from scenes import (
     ANGLE,
     AXIS,
     FORWARD,
     PIVOT,
     SLIDE,
+    nearest,
     one_thread,  # noqa: F401
     scene,
 )
@@ -28,10 +28,9 @@ def prepared(kind: str) -> tuple[Surface, Surface, ScoreVolume, np.ndarray]:
     """Surfaces of both states of the made scene, the volume of state 1, and which points of state 0 move."""
     made = scene("revolute" if kind == "revolute" else "prismatic", 96, 0.04)
     low, high = bounds([made.at(s).means.numpy() for s in (0, 1)])
-    sights = [look(made.at(s), made.views[s], 96, 0.02) for s in (0, 1)]
-    a, b = (on_surface(made.at(s), sights[s]) for s in (0, 1))
-    volume = score_volume(b.points, b.colours, sights[1], sights[0], low, high, CELLS)
-    return a, b, volume, made.gaussians.part.numpy()[a.index] == 1
+    a, b = (surface_of(made.at(s), made.views[s], (), 96, 0.02, 0.02) for s in (0, 1))
+    volume = score_volume(b.points, b.colours, b.sight, a.sight, low, high, CELLS)
+    return a, b, volume, made.gaussians.part.numpy()[nearest(a.points, made.gaussians)] == 1
 
 
 def displaced(points: np.ndarray, T: np.ndarray) -> np.ndarray:
@@ -154,5 +153,5 @@ def test_leaving_the_volume_is_like_free_space() -> None:
 def test_colours_of_the_scene_are_what_was_painted() -> None:
     a, *_ = prepared("prismatic")
     made = scene("prismatic", 96, 0.04)
-    painted = (made.gaussians.sh[a.index, 0] * SH_C0 + 0.5).numpy()
+    painted = (made.gaussians.sh[nearest(a.points, made.gaussians), 0] * SH_C0 + 0.5).numpy()
     np.testing.assert_allclose(a.colours, painted, atol=1e-6)

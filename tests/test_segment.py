@@ -1,40 +1,45 @@
 """Which Gaussians move, with which motion: the pieces, and the whole on a made object."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Literal
 
 import numpy as np
 import pytest
 
+from hingesplat.gaussians import concatenate
 from hingesplat.register import Sheet
+from hingesplat.render import render
 from hingesplat.screw import prismatic, revolute
 from hingesplat.search import Motion
 from hingesplat.segment import (
+    PATCH,
     Labelling,
     SegmentConfig,
-    Surface,
     axis_directions,
-    bounds,
     components,
+    distinct,
+    eliminate,
     floating,
     groups_to_try,
     inverted,
     label_costs,
     moved,
     neighbour_weights,
-    on_surface,
     reattach_fragments,
     registered,
     seed_costs,
     segment,
-    select_motions,
     softmax,
     split_pieces,
     spread_labels,
-    thin,
+    survey,
     track,
 )
-from hingesplat.visibility import FREE, HIDDEN, SURFACE, Sight, ask, look
+from hingesplat.stereo import DepthMap, StereoConfig, depth_map, stereo
+from hingesplat.surface import Surface, bounds, surface_of, thin
+from hingesplat.visibility import FREE, HIDDEN, SURFACE, Sight, ask
 from scenes import (
     ANGLE,
     AXIS,
@@ -43,7 +48,11 @@ from scenes import (
     SLIDE,
     Scene,
     angle_between,
+    box,
+    cameras_around,
+    nearest,
     one_thread,  # noqa: F401
+    photograph,
     scene,
 )
 
@@ -65,10 +74,17 @@ def made_scene(kind: Literal["revolute", "prismatic", "static"]) -> Scene:
     return scene(kind, 96, 0.024)
 
 
-def surface_of(points: np.ndarray) -> Surface:
-    """Points that no camera sees."""
-    n = len(points)
-    return Surface(points, np.full((n, 3), 0.5), np.arange(n), NO_SIGHT, np.tile([0.0, 0, 1], (n, 1)))
+@cache
+def made_maps(kind: Literal["revolute", "prismatic"]) -> tuple[list[DepthMap], list[DepthMap]]:
+    """Depth of both states' photographs by stereo. Cached: treat it as read-only."""
+    config = StereoConfig(image_size=96, planes=48)
+    first, second = (stereo(views, config) for views in made_scene(kind).views)
+    return first, second
+
+
+def plain(points: np.ndarray, sight: Sight = NO_SIGHT) -> Surface:
+    """Grey points, flat in z, that no camera sees but those of ``sight``."""
+    return Surface(points, np.full(points.shape, 0.5), np.tile([0.0, 0, 1], (len(points), 1)), sight)
 
 
 def patch(centre: tuple[float, float, float], n: int = 15, spacing: float = 0.01) -> np.ndarray:
@@ -97,13 +113,13 @@ def test_components_are_the_connected_pieces() -> None:
 
 def test_groups_are_pieces_and_patches_of_the_large_ones() -> None:
     speck = patch((5, 5, 0), 3)
-    small, large = patch((0, 0, 0), 10), patch((3, 0, 0), 20)
+    small, large = patch((0, 0, 0), 10), patch((3, 0, 0), 30)
     groups = groups_to_try(np.concatenate([speck, small, large]), 1.0, seed=0)
-    whole = [g for g in groups if len(g) in (100, 400)]
-    assert {tuple(g) for g in whole} == {tuple(range(9, 109)), tuple(range(109, 509))}
-    patches = [g for g in groups if len(g) not in (100, 400)]
-    assert len(patches) == 6 and min(map(len, patches)) >= 12
-    assert sorted(np.concatenate(patches)) == list(range(109, 509))
+    whole = [g for g in groups if len(g) in (100, 900)]
+    assert {tuple(g) for g in whole} == {tuple(range(9, 109)), tuple(range(109, 1009))}
+    patches = [g for g in groups if len(g) not in (100, 900)]
+    assert len(patches) == 900 // PATCH and min(map(len, patches)) >= 12
+    assert sorted(np.concatenate(patches)) == list(range(109, 1009))
     assert groups_to_try(speck[:0], 1.0, seed=0) == []
 
 
@@ -143,45 +159,103 @@ def test_softmax_bears_large_numbers() -> None:
 
 # Choosing motions.
 
-
-def costs_of_two_parts(n: int = 100) -> np.ndarray:
-    """Seeds of two parts, 0 and 1 (twice as large), and hypotheses: 0, 1, 1 again but worse, neither, hides all."""
-    part = np.repeat([0, 1], [n, 2 * n])
-    free, seen = 1.2, 0.1
-    return np.column_stack(
-        [
-            np.where(part == 0, seen, free),
-            np.where(part == 1, seen, free),
-            np.where(part == 1, seen + 0.05, free),
-            np.full(3 * n, free),
-            np.full(3 * n, 0.55),
-        ]
-    )
+PRICE = 50.0
 
 
-def test_as_many_motions_as_pay_for_themselves() -> None:
-    assert sorted(select_motions(costs_of_two_parts(), SegmentConfig(), None)) == [0, 1]
-    assert select_motions(costs_of_two_parts(), SegmentConfig(part_cost=100), None) == [1]
-    assert select_motions(costs_of_two_parts(), SegmentConfig(part_cost=1000), None) == []
-    assert select_motions(costs_of_two_parts(), SegmentConfig(max_parts=1), None) == [1]
+def slides(*values: float) -> list[Motion]:
+    return [replace(PULL, value=v) for v in values]
 
 
-def test_a_given_number_of_motions_is_not_exceeded() -> None:
-    assert select_motions(costs_of_two_parts(), SegmentConfig(), 1) == [1]
-    assert sorted(select_motions(costs_of_two_parts(), SegmentConfig(part_cost=1000), 2)) == [0, 1]
+def test_small_parts_get_hypotheses_too() -> None:
+    """Ten hypotheses for a large part, and one for a part a tenth as large, which alone they would crowd out."""
+    large = np.repeat([True, False], [300, 30])
+    costs = np.where(large[:, None], np.linspace(0.1, 0.2, 11), 1.2)
+    costs[:, 10] = np.where(large, 1.2, 0.1)
+    kept = distinct(slides(*np.arange(1.0, 12.0)), costs, np.zeros((1, 3)), 0.1, 9)
+    assert len(kept) == 9 and kept[0] == 0
+    assert 10 in kept
+    assert (np.argsort(-np.maximum(0.6 - costs, 0).sum(0)) == 10).argmax() == 10  # By its worth it came last.
 
 
-def test_a_motion_that_only_hides_explains_nothing() -> None:
-    assert select_motions(costs_of_two_parts()[:, 4:], SegmentConfig(), None) == []
+def test_hypotheses_are_apart(rng: np.random.Generator) -> None:
+    points, motions = rng.uniform(-1, 1, (20, 3)), slides(*rng.uniform(0, 1, 60))
+    costs = rng.uniform(0, 1.2, (50, 60))
+    kept = distinct(motions, costs, points, 0.05, 60)
+    value = np.array([motions[k].value for k in kept])
+    between = np.abs(value[:, None] - value)[np.triu_indices(len(kept), 1)]
+    assert 5 < len(kept) < 21 and between.min() > 0.05
+    assert kept[0] == np.maximum(0.6 - costs, 0).sum(0).argmax()
+    for m in motions:  # Every one is left out for one that stays.
+        assert np.abs(m.value - value).min() <= 0.05
+    assert distinct(motions, costs, points, 0.05, 3) == kept[:3]
+    twice = [TURN, replace(TURN, axis=-AXIS, value=-ANGLE), PULL]
+    assert len(distinct(twice, costs[:, :3], points, 0.05, 60)) == 2
 
 
-def test_a_motion_that_later_ones_make_superfluous_goes() -> None:
-    n = 100
-    part = np.repeat([0, 1], n)
-    compromise = np.full(2 * n, 0.3)
-    exact = [np.where(part == k, 0.0, 1.2) for k in (0, 1)]
-    chosen = select_motions(np.column_stack([compromise, *exact]), SegmentConfig(), None)
-    assert sorted(chosen) == [1, 2]
+def costs_of(*sizes: int) -> np.ndarray:
+    """Points of a base and of parts, of these sizes, and labels: to stay, then the true motion of each part."""
+    part = np.repeat(np.arange(len(sizes)), sizes)
+    costs = np.where(part[:, None] == np.arange(len(sizes)), 0.1, 1.1)
+    costs[part == 0, 0] = 0
+    return costs
+
+
+def with_compromise(costs: np.ndarray) -> np.ndarray:
+    """One motion more, the first, that is nearly right for every part."""
+    moves = costs[:, 0] > 0.5
+    return np.insert(costs, 1, np.where(moves, 0.35, 1.1), axis=1)
+
+
+def greedy(costs: np.ndarray, price: float) -> list[int]:
+    """The motion that helps most, then the next, as long as it pays."""
+    best, chosen = costs[:, 0], []
+    while (gain := np.maximum(best[:, None] - costs, 0).sum(0)).max() > price:
+        chosen.append(int(gain.argmax()))
+        best = np.minimum(best, costs[:, chosen[-1]])
+    return chosen
+
+
+def test_two_right_motions_beat_one_that_is_nearly_right_for_both() -> None:
+    costs = with_compromise(costs_of(300, 150, 150))
+    assert greedy(costs, PRICE) == [1]
+    assert sorted(eliminate(costs, PRICE, None)) == [2, 3]
+
+
+def test_generating_motions_are_found_among_many(rng: np.random.Generator) -> None:
+    true = costs_of(400, 250, 150, 100)
+    worse = true[:, [1, 2, 3, 1, 2]] + 0.15
+    lucky = np.where(rng.random((len(true), 20)) < 0.2, 0.2, 1.1)
+    costs = np.concatenate([with_compromise(true), worse, lucky], 1) + rng.uniform(0, 0.05, (len(true), 30))
+    assert sorted(eliminate(costs, PRICE, None)) == [2, 3, 4]
+
+
+def test_a_motion_must_be_worth_its_price() -> None:
+    costs = costs_of(100, 200, 80)
+    for price, chosen in ((10, [1, 2]), (79, [1, 2]), (81, [1]), (199, [1]), (201, [])):
+        assert sorted(eliminate(costs, price, None)) == chosen, price
+
+
+@pytest.mark.parametrize("parts", [0, 1, 2, 3])
+def test_as_many_motions_as_were_asked_for(parts: int) -> None:
+    costs = costs_of(100, 400, 200, 100)
+    for price in (0, 1e6):
+        assert sorted(eliminate(costs, price, parts)) == list(range(1, parts + 1))
+
+
+def test_to_stay_is_free() -> None:
+    """It costs no part, so it is there at any price and even if it is missed least."""
+    assert eliminate(costs_of(300, 30), PRICE, None) == []
+    assert eliminate(costs_of(0, 90, 90), PRICE, 2) == [1, 2]
+    assert eliminate(costs_of(1, 90, 80), PRICE, 1) == [1]
+    base_only = np.column_stack([np.zeros(100), np.zeros(100), np.full(100, 0.2)])
+    assert eliminate(base_only, 1.0, None) == []
+
+
+def test_what_was_dropped_too_early_comes_back() -> None:
+    """The compromise is the first to go while both exact motions are there, and the better one for one part only."""
+    costs = with_compromise(costs_of(300, 150, 150))
+    assert eliminate(costs, PRICE, 1) == [1]
+    assert costs[:, [0, 1]].min(1).sum() < min(costs[:, [0, k]].min(1).sum() for k in (2, 3))
 
 
 # Labels.
@@ -195,49 +269,129 @@ def test_neighbours_of_another_colour_weigh_less() -> None:
     assert w[0, 1] == pytest.approx(np.exp(-1)) and 0 < w[0, 2] < 0.1 * w[0, 1]
 
 
+Turned = tuple[Scene, tuple[Surface, Surface], float]
+
+
 @pytest.fixture(scope="module")
-def turned() -> tuple[Scene, tuple[Surface, Surface], float]:
+def turned() -> Turned:
+    """Each state's surface as the Gaussians have it, and the extent of the object."""
     made = made_scene("revolute")
-    pair = made.gaussians, made.at(1)
-    low, high = bounds([g.means.numpy() for g in pair])
-    extent = float((high - low).max())
-    sights = [look(g, v, 96, 0.012 * extent) for g, v in zip(pair, made.views, strict=True)]
-    return made, (on_surface(pair[0], sights[0]), on_surface(pair[1], sights[1])), extent
+    low, high, surfaces = survey((made.gaussians, made.at(1)), made.views, ((), ()), CONFIG)
+    return made, surfaces, float((high - low).max())
 
 
-def test_surface_is_what_cameras_see(turned: tuple[Scene, tuple[Surface, Surface], float]) -> None:
+def parts_of(made: Scene, surface: Surface, state: int = 0) -> np.ndarray:
+    return made.gaussians.part.numpy()[nearest(surface.points, made.at(state))]
+
+
+def test_surface_is_what_cameras_see(turned: Turned) -> None:
     made, (first, _), _ = turned
-    np.testing.assert_array_equal(first.points, made.gaussians.means.numpy()[first.index])
-    hidden = np.setdiff1d(np.arange(len(made.gaussians)), first.index)
-    assert 0.6 < len(first.points) / len(made.gaussians) < 0.98
-    front_of_box = np.abs(made.gaussians.means.numpy()[hidden] - [0, -0.34, 0]).max(1) < 0.36
+    means = made.gaussians.means.numpy()
+    shown = nearest(first.points, made.gaussians)
+    np.testing.assert_array_equal(first.points, means[shown])
+    hidden = np.setdiff1d(np.arange(len(means)), shown)
+    assert 0.6 < len(first.points) / len(means) < 0.98
+    front_of_box = np.abs(means[hidden] - [0, -0.34, 0]).max(1) < 0.36
     assert front_of_box.mean() > 0.8  # What is hidden lies between box and slab.
 
 
-def test_true_motions_cost_their_own_points_least(turned: tuple[Scene, tuple[Surface, Surface], float]) -> None:
-    made, (first, second), _ = turned
+def test_maps_lift_the_lid_that_a_fit_has_put_on() -> None:
+    """No mask contradicts a lid on a hollow, but depth does."""
+    rim, floor = 0.15, -0.25
+    walls = [(-0.4, -0.4, -0.35, 0.4), (0.35, -0.4, 0.4, 0.4), (-0.35, -0.4, 0.35, -0.35), (-0.35, 0.35, 0.35, 0.4)]
+    boxes = [box((*w[:2], floor), (*w[2:], rim), 0.03, seed=3) for w in walls]
+    tray = concatenate([*boxes, box((-0.35, -0.35, floor), (0.35, 0.35, floor + 0.05), 0.03, seed=4)])
+    lid = box((-0.35, -0.35, rim - 0.02), (0.35, 0.35, rim), 0.03, seed=3)
+    cameras = cameras_around(12, 96)
+    views = [photograph(tray, c) for c in cameras]
+    drawn = [render(tray, c) for c in cameras]
+    depth = [np.where(r.alpha > 0.5, r.depth / r.alpha.clamp_min(0.1), 0).astype(np.float32) for r in drawn]
+    maps = [depth_map(view, d) for view, d in zip(views, depth, strict=True)]
+
+    def share_on_lid(maps: Sequence[DepthMap]) -> float:
+        p = surface_of(concatenate([tray, lid]), views, maps, 96, 0.02, 0.015).points
+        return float(((np.abs(p[:, :2]).max(1) < 0.3) & (p[:, 2] > 0)).mean())
+
+    assert share_on_lid(()) > 0.1
+    assert share_on_lid(maps) < 0.005
+
+
+def wall(depth: float, views: int = 4) -> Sight:
+    """Cameras at z = -3, all of which see nothing but a grey wall, ``depth`` away."""
+    P = np.array([[20, 0, 20, 60], [0, 20, 20, 60], [0, 0, 1, 3]], np.float32)
+    return Sight(
+        np.tile(P, (views, 1, 1)),
+        np.full((views, 40, 40), depth, np.float32),
+        np.full((views, 40, 40, 3), 0.5, np.float32),
+        0.05,
+    )
+
+
+def up(z: float) -> np.ndarray:
+    return prismatic(np.eye(3)[2], z)
+
+
+def test_seen_costs_less_than_hidden_and_hidden_less_than_in_the_air() -> None:
+    """The wall is at z = 0 in one state and at z = 0.5 in the other."""
+    mine = plain(patch((0, 0, 0), 5), wall(3))
+    stay, air, seen, hidden = label_costs(mine, wall(3.5), [up(0.2), up(0.5), up(1)], extent=1).T
+    assert (seen < hidden).all() and (hidden < 0.5 * air).all() and (seen < 0.5 * stay).all()
+    # One photograph that sees it there says little: a surface is hidden from most sides, but not from all.
+    cost_of_seen = [label_costs(mine, wall(3.5, n), [up(0.5)], extent=1)[:, 1].mean() for n in (1, 2, 4, 8)]
+    assert cost_of_seen[0] > cost_of_seen[1] > cost_of_seen[2] == pytest.approx(cost_of_seen[3])
+    # To be recognised far away is a bolder claim, to be recognised in another colour a weaker one.
+    assert (seen < label_costs(mine, wall(3.5), [up(0.5)], extent=0.4)[:, 1]).all()
+    red = replace(mine, colours=np.tile([1.0, 0, 0], (25, 1)))
+    assert (seen < label_costs(red, wall(3.5), [up(0.5)], extent=1)[:, 1]).all()
+
+
+def test_to_stay_costs_the_static_nothing() -> None:
+    mine = plain(patch((0, 0, 0), 5), wall(3))
+    costs = label_costs(mine, wall(3), [np.eye(4), up(0.3)], extent=1)
+    assert (costs[:, 0] == 0).all()
+    assert (costs[:, 1:] > 0).all()  # To move is a claim, even to nowhere.
+
+
+def test_what_floats_at_home_may_float_there() -> None:
+    """A fit's points lie a little in front of their surface: its own photographs see them in free space, too."""
+    sound, loose = plain(patch((0, 0, 0), 5), wall(3)), plain(patch((0, 0, 0), 5), wall(3.5))
+    assert (label_costs(sound, wall(3.5), [], extent=1) > 1).all()
+    assert (label_costs(loose, wall(3.5), [], extent=1) < 0.5).all()
+
+
+def test_a_seed_must_go_somewhere() -> None:
+    mine = plain(patch((0, 0, 0), 5), wall(3))
+    motions = [up(0.2), up(0.5), up(1)]
+    costs, judged = label_costs(mine, wall(3.5), motions, extent=1), seed_costs(mine, wall(3.5), motions, 1)
+    assert judged.shape == (25, 3)
+    np.testing.assert_allclose(judged[:, 1], costs[:, 2])
+    assert (judged[:, 2] > costs[:, 3]).all()
+
+
+def test_true_motions_cost_their_own_points_least(turned: Turned) -> None:
+    made, (first, second), extent = turned
     wrong = replace(TURN, value=-ANGLE)
     forward, backward = [TURN.T, wrong.T], [inverted(TURN).T, inverted(wrong).T]
-    for surface, other, transforms in ((first, second.sight, forward), (second, first.sight, backward)):
-        part = made.gaussians.part.numpy()[surface.index]
-        costs = label_costs(surface, other, transforms)
+    for surface, other, transforms, state in ((first, second.sight, forward, 0), (second, first.sight, backward, 1)):
+        part = parts_of(made, surface, state)
+        costs = label_costs(surface, other, transforms, extent=extent)
         assert costs.shape == (len(part), 3)
         assert (costs[part == 0].argmin(1) == 0).mean() > 0.8
         assert costs[part == 1].mean(0).argmin() == 1
-        judged = seed_costs(surface, other, transforms)[part == 1].mean(0)
+        judged = seed_costs(surface, other, transforms, extent)[part == 1].mean(0)
         assert judged[0] < 0.8 * judged[1]
 
 
-def test_only_what_moved_floats(turned: tuple[Scene, tuple[Surface, Surface], float]) -> None:
+def test_only_what_moved_floats(turned: Turned) -> None:
     made, (first, second), _ = turned
-    up = floating(ask(first.points, first.colours, second.sight))
-    part = made.gaussians.part.numpy()[first.index]
-    assert part[up].mean() > 0.99
-    assert up[part == 1].mean() > 0.5
+    floats = floating(ask(first.points, first.colours, second.sight))
+    part = parts_of(made, first)
+    assert part[floats].mean() > 0.99
+    assert floats[part == 1].mean() > 0.5
 
 
 def test_labels_follow_the_motions_and_a_false_one_is_dropped(
-    turned: tuple[Scene, tuple[Surface, Surface], float],
+    turned: Turned,
 ) -> None:
     made, surfaces, extent = turned
     problem = Labelling.of(surfaces, extent)
@@ -245,15 +399,28 @@ def test_labels_follow_the_motions_and_a_false_one_is_dropped(
     kept, labels = problem.solve([false.T, TURN.T], 20.0, None)
     assert kept == [1]
     for s in (0, 1):
-        part = made.gaussians.part.numpy()[surfaces[s].index]
+        part = parts_of(made, surfaces[s], s)
         assert (labels[s] == part).mean() > 0.92
+        assert (problem.labels([TURN.T])[s] == labels[s]).all()
     assert problem.solve([false.T, TURN.T], 20.0, 2)[0] == [0, 1]
     assert problem.solve([false.T, TURN.T], 20.0, 0)[0] == []
 
 
-def test_registered_keeps_the_kind_and_the_sign(turned: tuple[Scene, tuple[Surface, Surface], float]) -> None:
+def test_smoothing_agrees_with_the_truth_more_than_single_points_do(turned: Turned) -> None:
+    made, surfaces, extent = turned
+    problem = Labelling.of(surfaces, extent)
+    wrong = replace(TURN, value=-ANGLE)
+    smoothed = problem.smoothed([TURN.T, wrong.T])
+    part = np.concatenate([parts_of(made, surface, s) for s, surface in enumerate(surfaces)])
+    assert smoothed.shape == (len(part), 3)
+    single = np.concatenate(problem.costs([TURN.T, wrong.T]))
+    assert (smoothed.argmin(1) == part).mean() > max((single.argmin(1) == part).mean(), 0.85)
+    assert eliminate(smoothed, PRICE, None) == [1]
+
+
+def test_registered_keeps_the_kind_and_the_sign(turned: Turned) -> None:
     made, (first, second), extent = turned
-    mine = first.rows(np.flatnonzero(made.gaussians.part.numpy()[first.index] == 1)[::3])
+    mine = first.rows(np.flatnonzero(parts_of(made, first) == 1)[::3])
     for sign in (1.0, -1.0):
         start = Motion("revolute", sign * AXIS, PIVOT + 0.01, sign * (ANGLE + 0.04), 0.5)
         fitted = registered(start, mine.sheet, second.sheet, extent)
@@ -268,7 +435,7 @@ def test_registered_keeps_the_kind_and_the_sign(turned: tuple[Scene, tuple[Surfa
         np.testing.assert_allclose(fitted.axis * fitted.value, SLIDE * FORWARD, atol=0.002)
 
 
-def test_registering_a_slide_of_nothing_is_no_error(turned: tuple[Scene, tuple[Surface, Surface], float]) -> None:
+def test_registering_a_slide_of_nothing_is_no_error(turned: Turned) -> None:
     _, (first, _), extent = turned
     still = replace(PULL, value=0.0)
     np.testing.assert_allclose(registered(still, first.sheet, first.sheet, extent).T, np.eye(4), atol=1e-6)
@@ -281,7 +448,7 @@ def test_pieces_far_apart_become_parts_with_one_motion() -> None:
     base, first, second = patch((0, 0, -1), 20), patch((0, 0, 0)), patch((0.5, 0, 0))
     everything = np.concatenate([base, first, second])
     label = np.repeat([0, 1, 1], [400, 225, 225])
-    surfaces = (surface_of(everything), surface_of(np.concatenate([base, moved(everything[400:], shift.T)])))
+    surfaces = (plain(everything), plain(np.concatenate([base, moved(everything[400:], shift.T)])))
     motions, labels = split_pieces([shift], (label, label), surfaces, 1.0, SegmentConfig())
     assert motions == [shift, shift]
     for found in labels:
@@ -290,38 +457,81 @@ def test_pieces_far_apart_become_parts_with_one_motion() -> None:
         assert found[400] != found[-1] and 0 not in found[400:]
     np.testing.assert_array_equal(labels[0], labels[1])
     near = np.concatenate([base, first, first + np.array([0.15, 0, 0])])
-    joined = (surface_of(near), surface_of(np.concatenate([base, moved(near[400:], shift.T)])))
+    joined = (plain(near), plain(np.concatenate([base, moved(near[400:], shift.T)])))
     motions, labels = split_pieces([shift], (label, label), joined, 1.0, SegmentConfig())
     assert motions == [shift] and labels[0].max() == 1
 
 
+SHIFT = Motion("prismatic", np.eye(3)[2], np.zeros(3), 0.5, 1.0)
+BASE, PART = patch((0, 0, -1), 20), patch((0, 0, 0))
+
+
+def both_states(*parts: tuple[np.ndarray, Motion]) -> tuple[Surface, Surface]:
+    """The base and parts that moved."""
+    here, there = (plain(np.concatenate([BASE, *p])) for p in zip(*((p, moved(p, m.T)) for p, m in parts), strict=True))
+    return here, there
+
+
+def test_a_piece_seen_in_one_state_only_is_no_part() -> None:
+    """The inside of a drawer is there when it is open."""
+    second = patch((0.5, 0, 0))
+    surfaces = (plain(np.concatenate([BASE, PART])), both_states((PART, SHIFT), (second, SHIFT))[1])
+    label = np.repeat([0, 1, 1], [400, 225, 225])
+    for given, states in (((label[:625], label), surfaces), ((label, label[:625]), (surfaces[1], surfaces[0]))):
+        motion = SHIFT if len(given[0]) == 625 else inverted(SHIFT)
+        motions, labels = split_pieces([motion], given, states, 1.0, SegmentConfig())
+        assert motions == [motion]
+        assert [set(found) for found in labels] == [{0, 1}, {0, 1}]
+
+
+def test_a_piece_goes_back_to_the_part_that_it_moves_with() -> None:
+    """Two motions nearly the same share a part between them, and the smaller share touches the larger."""
+    stray, far = patch((0.16, 0, 0)), patch((0.8, 0, 0), 20)
+    label = np.repeat([0, 1, 2, 2], [400, 225, 225, 400])
+    other = Motion("prismatic", np.eye(3)[0], np.zeros(3), 0.3, 1.0)
+    for kin, motion, parts in ((True, replace(SHIFT, value=0.505), 2), (False, other, 3)):
+        surfaces = both_states((PART, SHIFT), (stray, motion), (far, motion))
+        motions, labels = split_pieces([SHIFT, motion], (label, label), surfaces, 1.0, SegmentConfig())
+        assert len(motions) == parts
+        for found in labels:
+            assert (found[400:625] == 1).all() and (found[:400] == 0).all()
+            assert ((found[625:850] == 1).all()) == kin
+            assert len(set(found[850:])) == 1 and found[-1] > 1
+
+
 def test_fragments_go_to_what_they_touch() -> None:
     """A speck of part 1 in the middle of the base is the base's."""
-    shift = Motion("prismatic", np.eye(3)[2], np.zeros(3), 0.5, 1.0)
-    base, part = patch((0, 0, -1), 20), patch((0, 0, 0))
-    everything = np.concatenate([base, part])
     true = np.repeat([0, 1], [400, 225])
     wrong = true.copy()
     wrong[[190, 210, 211]] = 1
-    surfaces = (surface_of(everything), surface_of(np.concatenate([base, moved(part, shift.T)])))
+    surfaces = both_states((PART, SHIFT))
     for given in (true, wrong):
-        for found in reattach_fragments([shift.T], (given, given), surfaces, 1.0):
+        for found in reattach_fragments([SHIFT.T], (given, given), surfaces, 1.0):
             np.testing.assert_array_equal(found, true)
+
+
+def test_of_a_part_the_largest_piece_stays_and_of_the_base_every_large_one() -> None:
+    still = replace(SHIFT, value=0.0)
+    shelf, beside = patch((0, 0, -3), 10), patch((0, 0, -0.95), 14)
+    surfaces = both_states((shelf, still), (PART, SHIFT), (beside, still))
+    given = np.repeat([0, 0, 1, 1], [400, 100, 225, 196])
+    for found in reattach_fragments([SHIFT.T], (given, given), surfaces, 1.0):
+        np.testing.assert_array_equal(found, np.repeat([0, 0, 1, 0], [400, 100, 225, 196]))
 
 
 def test_labels_spread_to_the_nearest() -> None:
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0.2, 0, 0], [0.9, 0, 0]])
-    surface = replace(surface_of(points[:2]), index=np.array([0, 1]))
-    assert spread_labels(points, surface, np.array([3, 5])).tolist() == [3, 5, 3, 5]
+    assert spread_labels(points, plain(points[:2]), np.array([3, 5])).tolist() == [3, 5, 3, 5]
 
 
 # The whole.
 
 
-@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
-def test_the_one_moving_part_is_found(kind: Literal["revolute", "prismatic"]) -> None:
+@pytest.mark.parametrize(("kind", "depth"), [("revolute", False), ("prismatic", False), ("revolute", True)])
+def test_the_one_moving_part_is_found(kind: Literal["revolute", "prismatic"], depth: bool) -> None:
     made = made_scene(kind)
-    found = segment((made.gaussians, made.at(1)), made.views, CONFIG)
+    maps = made_maps(kind) if depth else ((), ())
+    found = segment((made.gaussians, made.at(1)), made.views, CONFIG, maps=maps)
     assert len(found.motions) == 1
     assert found.unexplained < 0.3 and found.seeds > 100
     T_true = made.T_state_0[1, 1]
@@ -360,7 +570,8 @@ def test_a_further_state_is_tracked_along_the_known_joint(kind: Literal["revolut
     known = TURN if kind == "revolute" else PULL
     labels = made.gaussians.part.numpy()
     for motion in (replace(known, value=0.4 * known.value), replace(known, axis=-known.axis)):
-        (T,) = track((made.gaussians, made.at(1)), made.views, labels, [motion], CONFIG)
+        maps = made_maps(kind) if kind == "revolute" else ((), ())
+        (T,) = track((made.gaussians, made.at(1)), made.views, labels, [motion], CONFIG, maps=maps)
         assert angle_between(T, made.T_state_0[1, 1]) < 1.0
         np.testing.assert_allclose(T[:3, 3], made.T_state_0[1, 1, :3, 3], atol=0.01)
 

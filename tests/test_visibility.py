@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hingesplat.gaussians import Gaussians
+from hingesplat.gaussians import Gaussians, concatenate
+from hingesplat.stereo import DepthMap, fused, measured
 from hingesplat.visibility import COLOUR, FREE, HIDDEN, SURFACE, Sight, ask, look
-from scenes import box, cameras_around, look_at, photograph, texture
+from scenes import box, cameras_around, look_at, open_box, photograph, sheet, texture
 
 SIZE = 96
 TOLERANCE = 0.03
@@ -97,3 +98,81 @@ def test_look_keeps_each_cameras_shape_and_shrinks_to_the_size(solid: Gaussians)
     for P, view in zip(sight.P, views, strict=True):
         h = CENTRES @ P[:, :3].T + P[:, 3]
         np.testing.assert_allclose(2 * h[:, :2] / h[:, 2:], view.camera.project(CENTRES)[0], rtol=1e-4)
+
+
+# With depth that is known.
+
+
+def boxed_in() -> Gaussians:
+    """The open box as a careless fit would have it: with a lid."""
+    cloud = fused(measured(open_box(SIZE), SIZE), 0.04)
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(-0.45, 0.45, 24), np.linspace(-0.35, 0.35, 18)))
+    lid = np.column_stack([x, y, np.full(x.shape, 0.4)])
+    return concatenate(
+        [
+            sheet(cloud.points, cloud.normals, cloud.colours, 0.03),
+            sheet(lid, np.tile([0.0, 0, 1], (len(lid), 1)), np.full(lid.shape, 0.5), 0.03),
+        ]
+    )
+
+
+def unknown(maps: list[DepthMap], every: int) -> list[DepthMap]:
+    """Nothing is known of each ``every``-th photograph."""
+    return [replace(m, depth=np.zeros_like(m.depth)) if i % every == 0 else m for i, m in enumerate(maps)]
+
+
+IN_THE_HOLLOW = np.random.default_rng(0).uniform(-1, 1, (40, 3)) * [0.35, 0.25, 0.1] + [0, 0, 0.1]
+
+
+def test_known_depth_wins_over_what_is_rendered() -> None:
+    views = open_box(SIZE)
+    maps = measured(views, SIZE)
+    plain, knowing = look(boxed_in(), views, SIZE, TOLERANCE), look(boxed_in(), views, SIZE, TOLERANCE, maps)
+    for before, after, m in zip(plain.depth, knowing.depth, maps, strict=True):
+        known = (before != 0) & (m.depth > 0)
+        np.testing.assert_array_equal(after[known], m.depth[known])
+        assert (after[before == 0] == 0).all()  # The photograph has the last word on the mask.
+    assert (answer(IN_THE_HOLLOW, plain)[:, HIDDEN] >= 10).all()
+    assert (answer(IN_THE_HOLLOW, knowing)[:, FREE] >= 8).all()
+
+
+def test_known_depth_is_looked_up_at_the_sights_size() -> None:
+    views = open_box(SIZE)
+    maps = measured(views, SIZE)
+    sight = look(boxed_in(), views, SIZE // 2, TOLERANCE, maps)
+    known = (sight.depth[0] != 0) & (maps[0].depth[1::2, 1::2] > 0)
+    np.testing.assert_array_equal(sight.depth[0][known], maps[0].depth[1::2, 1::2][known])
+
+
+def test_nothing_is_said_where_others_see_through_what_is_rendered() -> None:
+    views = open_box(SIZE)
+    maps = unknown(measured(views, SIZE), 3)
+    plain, knowing = look(boxed_in(), views, SIZE, TOLERANCE), look(boxed_in(), views, SIZE, TOLERANCE, maps)
+    for i in range(0, 9, 3):  # From high above, where the lid fills the view of the hollow.
+        camera = views[i].camera
+        y, x = np.nonzero(plain.depth[i] > 0)
+        before, after = plain.depth[i][y, x], knowing.depth[i][y, x]
+        points = camera.lifted(x, y, before)
+        lid = (np.abs(points - [0, 0, 0.4]) < [0.3, 0.2, 0.02]).all(1)
+        assert lid.sum() > 50 and (after[lid] == -1).mean() > 0.95
+        outer = (np.abs(points[:, :2]) > [0.49, 0.39]).any(1) & (points[:, 2] < 0.3)
+        assert outer.sum() > 50 and (after[outer] == before[outer]).mean() > 0.9  # Edges are blends of two depths.
+
+
+def test_maps_that_know_nothing_change_nothing() -> None:
+    views = open_box(SIZE)[::4]
+    nothing = unknown(measured(views, SIZE), 1)
+    plain, same = look(boxed_in(), views, SIZE, TOLERANCE), look(boxed_in(), views, SIZE, TOLERANCE, nothing)
+    np.testing.assert_array_equal(plain.depth, same.depth)
+    np.testing.assert_array_equal(plain.rgb, same.rgb)
+
+
+def test_a_mask_without_gaussians_gets_the_depth_that_is_known() -> None:
+    views = open_box(SIZE)[:2]
+    maps = measured(views, SIZE)
+    far = boxed_in()
+    far.means = far.means + 50
+    assert set(np.unique(look(far, views, SIZE, TOLERANCE).depth)) == {-1, 0}
+    sight = look(far, views, SIZE, TOLERANCE, maps)
+    seen = maps[0].depth > 0
+    np.testing.assert_array_equal(sight.depth[0][seen], maps[0].depth[seen])

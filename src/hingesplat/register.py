@@ -51,6 +51,7 @@ def register(
     T: np.ndarray,
     extent: float,
     *,
+    turn: bool = True,
     iterations: int = 15,
     start_radius: float = 0.04,
     end_radius: float = 0.012,
@@ -58,7 +59,7 @@ def register(
     """Refine T (4×4, source to target) by point-to-plane distance over pairs alike in place, colour and side.
 
     A light pull along the tangent keeps texture in place where planes slide on themselves. Pairs farther apart than the
-    shrinking radius (fractions of the extent) are left out; directions that no pair constrains stay as they are.
+    shrinking radius (fractions of the extent) are left out; directions that no pair constrains stay as they are. Without ``turn`` the rotation stays as it is.
     """
     tree = KDTree(target.features(np.eye(4), extent))
     for i in range(iterations):
@@ -77,6 +78,8 @@ def register(
             residuals.append(weight * ((q - p) * direction).sum(1))
         A, b = np.concatenate(rows), np.concatenate(residuals)
         robust = 1 / (1 + (np.abs(b) / (0.3 * radius)) ** 2)
+        if not turn:
+            A[:, :3] = 0
         H = A.T @ (A * robust[:, None])
         damping = 1e-4 * np.diag(H).max() * np.eye(6)
         step = np.linalg.solve(H + damping, A.T @ (robust * b))

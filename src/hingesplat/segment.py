@@ -19,7 +19,7 @@ from hingesplat.capture import View
 from hingesplat.gaussians import Gaussians
 from hingesplat.register import Sheet, register
 from hingesplat.screw import matrix_to_screw
-from hingesplat.search import Motion, ScoreVolume, scan, score_volume
+from hingesplat.search import Motion, ScoreVolume, novelty, scan, score_volume
 from hingesplat.stereo import DepthMap
 from hingesplat.surface import Surface, bounds, surface_of, thin
 from hingesplat.visibility import COLOUR, FREE, HIDDEN, SURFACE, Sight, ask
@@ -29,6 +29,9 @@ Labels = tuple[np.ndarray, np.ndarray]
 
 LARGE_PIECE = 0.2
 """A piece this large beside the largest of its part is a part of its own, not a fragment."""
+
+PATCH = 150
+"""Seeds of a large piece for each patch that may be a part of its own."""
 
 PROMISING = 0.6
 """A hypothesis is worth as much as it explains its seeds better than this."""
@@ -60,7 +63,7 @@ class SegmentConfig:
     """A seed that a motion explains worse than this counts as unexplained."""
     consensus_cost: float = 0.45
     """A seed agrees with a motion that costs it less than this."""
-    consensus_motions: int = 30
+    consensus_motions: int = 50
     """Hypotheses that are refined on all seeds that agree with them."""
     part_cost: float = 45.0
     """Description length of one more part, in points (a point stands for 0.03² of the extent's square)."""
@@ -132,7 +135,7 @@ def groups_to_try(points: np.ndarray, extent: float, seed: int) -> list[np.ndarr
         if len(index) < 12:
             continue
         groups.append(index)
-        patches = min(len(index) // 60, 10)
+        patches = min(len(index) // PATCH, 8)
         if patches >= 2:
             which = kmeans2(points[index], patches, rng=np.random.default_rng(seed), minit="++")[1]
             groups += [index[which == p] for p in range(patches) if (which == p).sum() >= 12]
@@ -406,17 +409,19 @@ def segment(
     low, high, surfaces = survey(gaussians, views, maps, config)
     extent = float((high - low).max())
     sights = [surface.sight for surface in surfaces]
+    answers = [ask(surfaces[s].points, surfaces[s].colours, sights[1 - s]) for s in (0, 1)]
     seeds = []
-    for s in (0, 1):
-        surface = surfaces[s]
-        index = np.flatnonzero(floating(ask(surface.points, surface.colours, sights[1 - s])))
+    for surface, answer in zip(surfaces, answers, strict=True):
+        index = np.flatnonzero(floating(answer))
         seeds.append(index[thin(surface.points[index], 0.012 * extent, rng)])
+    # Where both states show a surface, nothing that moved has come to lie.
+    fresh = [s.rows(np.flatnonzero(novelty(a) > 0.5)) for s, a in zip(surfaces, answers, strict=True)]
 
     def volume(s: int, cells: int) -> ScoreVolume:
         return score_volume(surfaces[s].points, surfaces[s].colours, sights[s], sights[1 - s], low, high, cells)
 
     coarse, fine = [volume(s, config.cells) for s in (0, 1)], [volume(s, 2 * config.cells) for s in (0, 1)]
-    pool = propose(surfaces, seeds, coarse, fine, extent, config, rng)
+    pool = propose(surfaces, fresh, seeds, coarse, fine, extent, config, rng)
     n_seeds = sum(len(i) for i in seeds)
     if not pool:
         empty = (np.zeros(len(gaussians[0]), int), np.zeros(len(gaussians[1]), int))
@@ -432,7 +437,7 @@ def segment(
         )
 
     costs = costs_of(pool)
-    pool += consensus(pool, costs, surfaces, [i[: config.max_seeds] for i in seeds], fine, extent, config, rng)
+    pool += consensus(pool, costs, surfaces, fresh, [i[: config.max_seeds] for i in seeds], fine, extent, config, rng)
     costs = np.concatenate([costs, costs_of(pool[costs.shape[1] :])], 1)
     sample = np.concatenate([j.points[:100] for j in judges])
     chosen = [pool[k] for k in distinct(pool, costs, sample, 0.012 * extent, config.candidates)]
@@ -448,6 +453,7 @@ def segment(
                 chosen[k],
                 (rows[0][owned[0] == i + 1], rows[1][owned[1] == i + 1]),
                 surfaces,
+                fresh,
                 fine,
                 extent,
                 config,
@@ -602,6 +608,7 @@ def track(
 
 def propose(
     surfaces: tuple[Surface, Surface],
+    fresh: Sequence[Surface],
     seeds: Sequence[np.ndarray],
     coarse: Sequence[ScoreVolume],
     fine: Sequence[ScoreVolume],
@@ -609,7 +616,10 @@ def propose(
     config: SegmentConfig,
     rng: np.random.Generator,
 ) -> list[Motion]:
-    """Hypotheses, as motions from state 0 to 1, from every group of seeds of both states."""
+    """Hypotheses, as motions from state 0 to 1, from every group of seeds of both states.
+
+    ``fresh`` are the points of each state that the other does not show in the same place.
+    """
     groups = []
     for s in (0, 1):
         p = surfaces[s].points[seeds[s]]
@@ -630,7 +640,7 @@ def propose(
                     # Compare hypotheses at their best: on the grid a true one may be 3° off and lose to a lucky one.
                     for spread in (4.0, 1.5):
                         motion = refine_motion(motion, p, c, fine[1 - s], spread)
-                    motion = polished([motion], surfaces[s].rows(chosen), surfaces[1 - s], extent)
+                    motion = polished([motion], surfaces[s].rows(chosen), fresh[1 - s], extent)
                     pool.append(motion if s == 0 else inverted(motion))
     return pool
 
@@ -639,6 +649,7 @@ def consensus(
     pool: Sequence[Motion],
     costs: np.ndarray,
     surfaces: tuple[Surface, Surface],
+    fresh: Sequence[Surface],
     seeds: Sequence[np.ndarray],
     fine: Sequence[ScoreVolume],
     extent: float,
@@ -649,21 +660,12 @@ def consensus(
 
     A hypothesis comes from one patch; the right one fits the whole part, and grows better with it.
     """
-    gain = np.maximum(config.explained_cost - costs, 0) * (costs < HIDDEN_SEED_COST)
-    gain = gain.sum(0)
-    sample = surfaces[0].points[seeds[0][:100]] if len(seeds[0]) else surfaces[1].points[seeds[1][:100]]
-    refined: list[Motion] = []
-    ends: list[np.ndarray] = []
-    for k in np.argsort(-gain):
-        end = moved(sample, pool[k].T)
-        if any(np.linalg.norm(end - e, axis=1).mean() < 0.03 * extent for e in ends):
-            continue
-        ends.append(end)
-        motion, agree = pool[k], costs[:, k] < config.consensus_cost
+    sample = np.concatenate([surfaces[s].points[seeds[s][:100]] for s in (0, 1)])
+    refined = []
+    for k in distinct(pool, costs, sample, 0.02 * extent, config.consensus_motions):
+        agree = costs[:, k] < config.consensus_cost
         own = (seeds[0][agree[: len(seeds[0])]], seeds[1][agree[len(seeds[0]) :]])
-        refined.append(_refit(motion, own, surfaces, fine, extent, config, rng))
-        if len(refined) == config.consensus_motions:
-            break
+        refined.append(_refit(pool[k], own, surfaces, fresh, fine, extent, config, rng))
     return refined
 
 
@@ -671,6 +673,7 @@ def _refit(
     motion: Motion,
     own: tuple[np.ndarray, np.ndarray],
     surfaces: tuple[Surface, Surface],
+    fresh: Sequence[Surface],
     fine: Sequence[ScoreVolume],
     extent: float,
     config: SegmentConfig,
@@ -686,7 +689,7 @@ def _refit(
     if len(theirs.points) < config.min_part_seeds:
         few = mine.rows(np.arange(min(2 * config.seeds_per_search, len(mine.points))))
         near = refine_motion(start, few.points, few.colours, fine[1 - s], 3.0)
-        fit = polished([start, near], mine, surfaces[1 - s], extent)
+        fit = polished([start, near], mine, fresh[1 - s], extent)
         return fit if s == 0 else inverted(fit)
     # Against the whole of the other state a drawer would cling to the frame that it slides along.
     target = surfaces[1 - s].rows(own[1 - s]).sheet
@@ -721,7 +724,7 @@ def polished(trials: Sequence[Motion], mine: Surface, other: Surface, extent: fl
 
 def registered(motion: Motion, source: Sheet, target: Sheet, extent: float) -> Motion:
     """The motion after registration, of the same kind again: what another degree of freedom took up is dropped."""
-    T = register(source, target, motion.T, extent)
+    T = register(source, target, motion.T, extent, turn=motion.kind == "revolute")
     centroid = source.points.mean(0)
     if motion.kind == "prismatic":
         shift = T[:3, :3] @ centroid + T[:3, 3] - centroid
