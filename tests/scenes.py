@@ -184,7 +184,7 @@ def off_boards(points: np.ndarray) -> np.ndarray:
 
 def in_the_hollow(points: np.ndarray) -> np.ndarray:
     """(n,) bool: on the inner faces of the open box or between them, clear of its opening."""
-    return (np.abs(points) < [0.44, 0.34, 0.35]).all(1)
+    return np.all(np.abs(points) < [0.44, 0.34, 0.35], axis=1)
 
 
 def boards_depth(camera: Camera) -> np.ndarray:

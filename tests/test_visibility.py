@@ -8,7 +8,7 @@ import pytest
 from hingesplat.gaussians import Gaussians, concatenate
 from hingesplat.stereo import DepthMap, fused, measured
 from hingesplat.visibility import COLOUR, FREE, HIDDEN, SURFACE, Sight, ask, look
-from scenes import box, cameras_around, look_at, open_box, photograph, sheet, texture
+from scenes import box, cameras_around, look_at, off_boards, open_box, photograph, sheet, texture
 
 SIZE = 96
 TOLERANCE = 0.03
@@ -155,8 +155,18 @@ def test_nothing_is_said_where_others_see_through_what_is_rendered() -> None:
         points = camera.lifted(x, y, before)
         lid = (np.abs(points - [0, 0, 0.4]) < [0.3, 0.2, 0.02]).all(1)
         assert lid.sum() > 50 and (after[lid] == -1).mean() > 0.95
-        outer = (np.abs(points[:, :2]) > [0.49, 0.39]).any(1) & (points[:, 2] < 0.3)
-        assert outer.sum() > 50 and (after[outer] == before[outer]).mean() > 0.9  # Edges are blends of two depths.
+
+
+def test_a_surface_that_nobody_sees_through_stays() -> None:
+    views = open_box(SIZE)
+    maps = unknown(measured(views, SIZE), 3)
+    plain, knowing = look(boxed_in(), views, SIZE, TOLERANCE), look(boxed_in(), views, SIZE, TOLERANCE, maps)
+    for i in (18, 21):  # From the side.
+        y, x = np.nonzero(plain.depth[i] > 0)
+        before, after = plain.depth[i][y, x], knowing.depth[i][y, x]
+        points = views[i].camera.lifted(x, y, before)
+        outer = (np.abs(points[:, :2]) > [0.48, 0.38]).any(1) & (off_boards(points) < 0.01)
+        assert outer.sum() > 150 and (after[outer] == before[outer]).mean() > 0.85
 
 
 def test_maps_that_know_nothing_change_nothing() -> None:

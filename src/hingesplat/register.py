@@ -59,7 +59,8 @@ def register(
     """Refine T (4×4, source to target) by point-to-plane distance over pairs alike in place, colour and side.
 
     A light pull along the tangent keeps texture in place where planes slide on themselves. Pairs farther apart than the
-    shrinking radius (fractions of the extent) are left out; directions that no pair constrains stay as they are. Without ``turn`` the rotation stays as it is.
+    shrinking radius (fractions of the extent) are left out; directions that no pair constrains stay as they are.
+    Without ``turn`` the rotation stays as it is.
     """
     tree = KDTree(target.features(np.eye(4), extent))
     for i in range(iterations):

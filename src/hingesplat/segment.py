@@ -30,7 +30,7 @@ Labels = tuple[np.ndarray, np.ndarray]
 LARGE_PIECE = 0.2
 """A piece this large beside the largest of its part is a part of its own, not a fragment."""
 
-PATCH = 150
+PATCH = 60
 """Seeds of a large piece for each patch that may be a part of its own."""
 
 PROMISING = 0.6
@@ -135,7 +135,7 @@ def groups_to_try(points: np.ndarray, extent: float, seed: int) -> list[np.ndarr
         if len(index) < 12:
             continue
         groups.append(index)
-        patches = min(len(index) // PATCH, 8)
+        patches = min(len(index) // PATCH, 10)
         if patches >= 2:
             which = kmeans2(points[index], patches, rng=np.random.default_rng(seed), minit="++")[1]
             groups += [index[which == p] for p in range(patches) if (which == p).sum() >= 12]
@@ -190,7 +190,7 @@ def eliminate(costs: np.ndarray, price: float, parts: int | None) -> list[int]:
     right for both, which a greedy choice would take first.
     """
     kept = list(range(costs.shape[1]))
-    while len(kept) > 1 and len(kept) - 1 != parts:
+    while len(kept) > 1 and (parts is None or len(kept) - 1 > parts):
         best = np.argpartition(costs[:, kept], 1, axis=1)
         first, second = (np.take_along_axis(costs[:, kept], best[:, [i]], 1)[:, 0] for i in (0, 1))
         missed = np.bincount(best[:, 0], second - first, minlength=len(kept))
@@ -234,7 +234,13 @@ def refine_motion(
 
 
 def label_costs(
-    surface: Surface, other: Sight, transforms: Sequence[np.ndarray], *, extent: float, hidden_cost: float = 0.25
+    surface: Surface,
+    other: Sight,
+    transforms: Sequence[np.ndarray],
+    *,
+    extent: float,
+    hidden_cost: float = 0.25,
+    far_cost: float = 0.3,
 ) -> np.ndarray:
     """(n, 1 + transforms) cost of each label for each surface point, from the other state's photographs alone.
 
@@ -252,7 +258,7 @@ def label_costs(
         colour = np.clip((answer[:, COLOUR] - 0.05) / 0.5, 0, 1)
         # To move is a claim: it costs a little, and to be recognised far away costs more.
         way = np.linalg.norm(points - surface.points, axis=1) / extent
-        claim = 0.0 if T is None else 0.05 + 0.3 * way * arrived
+        claim = 0.0 if T is None else 0.05 + far_cost * way * arrived
         columns.append(contradiction + arrived * 0.5 * colour + (1 - arrived) * hidden_cost + claim)
     return np.stack(columns, 1)
 
@@ -262,9 +268,11 @@ def _free_share(answer: np.ndarray) -> np.ndarray:
     return answer[:, FREE] / np.maximum(answer[:, : HIDDEN + 1].sum(1), 1)
 
 
-def seed_costs(seeds: Surface, other: Sight, transforms: Sequence[np.ndarray], extent: float) -> np.ndarray:
+def seed_costs(
+    seeds: Surface, other: Sight, transforms: Sequence[np.ndarray], extent: float, far_cost: float = 0.3
+) -> np.ndarray:
     """(n, transforms) cost of each motion for each seed. Here hidden is worse than seen: a seed must go somewhere."""
-    return label_costs(seeds, other, transforms, extent=extent, hidden_cost=HIDDEN_SEED_COST)[:, 1:]
+    return label_costs(seeds, other, transforms, extent=extent, hidden_cost=HIDDEN_SEED_COST, far_cost=far_cost)[:, 1:]
 
 
 def neighbour_weights(points: np.ndarray, colours: np.ndarray, radius: float, k: int = 12) -> csr_matrix:
@@ -373,7 +381,7 @@ class Labelling:
         def run(keep: list[int], iterations: int) -> tuple[Labels, float]:
             return self.mean_field([c[:, keep] for c in costs], [p[:, keep] for p in partners], iterations)
 
-        while len(columns) > 1 and len(columns) - 1 != parts:
+        while len(columns) > 1 and (parts is None or len(columns) - 1 > parts):
             energy = run(columns, 8)[1]
             trials = {k: run([c for c in columns if c != k], 8)[1] for k in columns[1:]}
             worst = min(trials, key=lambda k: trials[k])
@@ -492,8 +500,9 @@ def split_pieces(
         size = each[0] + each[1]
         # A part is seen in both states; what is seen in one only is the inside of something.
         large = size >= max(LARGE_PIECE * size.max(), 5 * config.min_part_seeds)
-        large &= np.minimum(*each) >= config.min_part_seeds
-        large[size.argmax()] = size.max() > 0
+        both = np.minimum(*each) >= config.min_part_seeds
+        large &= both
+        large[np.where(both, size, 0).argmax() if both.any() else size.argmax()] = size.max() > 0
         for p in np.flatnonzero(large):
             result.append(motion)
             for s in (0, 1):
@@ -697,8 +706,8 @@ def _refit(
     trials = [start, once, registered(once, mine.sheet, target, extent)]
 
     def best(motions: Sequence[Motion]) -> Motion:
-        there = seed_costs(mine, surfaces[1 - s].sight, [m.T for m in motions], extent).sum(0)
-        back = seed_costs(theirs, surfaces[s].sight, [inverted(m).T for m in motions], extent).sum(0)
+        there = seed_costs(mine, surfaces[1 - s].sight, [m.T for m in motions], extent, 0.0).sum(0)
+        back = seed_costs(theirs, surfaces[s].sight, [inverted(m).T for m in motions], extent, 0.0).sum(0)
         return motions[int((there + back).argmin())]
 
     fit = best(values_around(best(trials), extent))
@@ -715,7 +724,7 @@ def polished(trials: Sequence[Motion], mine: Surface, other: Surface, extent: fl
     """The best of some motions, their registrations and a little more or less of these, as the cameras judge them."""
 
     def best(motions: Sequence[Motion]) -> Motion:
-        costs = seed_costs(mine, other.sight, [m.T for m in motions], extent)
+        costs = seed_costs(mine, other.sight, [m.T for m in motions], extent, 0.0)
         return motions[int(costs.mean(0).argmin())]
 
     motion = best([*trials, *(registered(m, mine.sheet, other.sheet, extent) for m in trials)])
