@@ -118,7 +118,7 @@ def test_groups_are_pieces_and_patches_of_the_large_ones() -> None:
     whole = [g for g in groups if len(g) in (100, 900)]
     assert {tuple(g) for g in whole} == {tuple(range(9, 109)), tuple(range(109, 1009))}
     patches = [g for g in groups if len(g) not in (100, 900)]
-    assert len(patches) == 900 // PATCH and min(map(len, patches)) >= 12
+    assert len(patches) == min(900 // PATCH, 10) and min(map(len, patches)) >= 12
     assert sorted(np.concatenate(patches)) == list(range(109, 1009))
     assert groups_to_try(speck[:0], 1.0, seed=0) == []
 
@@ -334,17 +334,17 @@ def up(z: float) -> np.ndarray:
 def test_seen_costs_less_than_hidden_and_hidden_less_than_in_the_air() -> None:
     """The wall is at z = 0 in one state and at z = 0.5 in the other."""
     mine, other = plain(patch((0, 0, 0), 5), wall(3)), plain(patch((0, 0, 0.5), 9), wall(3.5))
-    stay, air, seen, hidden = label_costs(mine, other, [up(0.2), up(0.5), up(1)], extent=1).T
+    stay, air, seen, hidden = label_costs(mine, other.sight, [up(0.2), up(0.5), up(1)], extent=1).T
     assert (seen < hidden).all() and (hidden < 0.5 * air).all() and (seen < 0.5 * stay).all()
     # To be recognised far away is a bolder claim, to be recognised in another colour a weaker one.
-    assert (seen < label_costs(mine, other, [up(0.5)], extent=0.4)[:, 1]).all()
+    assert (seen < label_costs(mine, other.sight, [up(0.5)], extent=0.4)[:, 1]).all()
     red = replace(mine, colours=np.tile([1.0, 0, 0], (25, 1)))
-    assert (seen < label_costs(red, other, [up(0.5)], extent=1)[:, 1]).all()
+    assert (seen < label_costs(red, other.sight, [up(0.5)], extent=1)[:, 1]).all()
 
 
 def test_to_stay_costs_the_static_nothing() -> None:
     mine = plain(patch((0, 0, 0), 5), wall(3))
-    costs = label_costs(mine, mine, [np.eye(4), up(0.3)], extent=1)
+    costs = label_costs(mine, mine.sight, [np.eye(4), up(0.3)], extent=1)
     assert (costs[:, 0] == 0).all()
     assert (costs[:, 1:] > 0).all()  # To move is a claim, even to nowhere.
 
@@ -353,14 +353,14 @@ def test_what_floats_at_home_may_float_there() -> None:
     """A fit's points lie a little in front of their surface: its own photographs see them in free space, too."""
     sound, loose = plain(patch((0, 0, 0), 5), wall(3)), plain(patch((0, 0, 0), 5), wall(3.5))
     other = plain(patch((0, 0, 0.5), 9), wall(3.5))
-    assert (label_costs(sound, other, [], extent=1) > 1).all()
-    assert (label_costs(loose, other, [], extent=1) < 0.5).all()
+    assert (label_costs(sound, other.sight, [], extent=1) > 1).all()
+    assert (label_costs(loose, other.sight, [], extent=1) < 0.5).all()
 
 
 def test_a_seed_must_go_somewhere() -> None:
     mine, other = plain(patch((0, 0, 0), 5), wall(3)), plain(patch((0, 0, 0.5), 9), wall(3.5))
     motions = [up(0.2), up(0.5), up(1)]
-    costs, judged = label_costs(mine, other, motions, extent=1), seed_costs(mine, other, motions, 1)
+    costs, judged = label_costs(mine, other.sight, motions, extent=1), seed_costs(mine, other.sight, motions, 1)
     assert judged.shape == (25, 3)
     np.testing.assert_allclose(judged[:, 1], costs[:, 2])
     assert (judged[:, 2] > costs[:, 3]).all()
@@ -372,11 +372,11 @@ def test_true_motions_cost_their_own_points_least(turned: Turned) -> None:
     forward, backward = [TURN.T, wrong.T], [inverted(TURN).T, inverted(wrong).T]
     for surface, other, transforms, state in ((first, second, forward, 0), (second, first, backward, 1)):
         part = parts_of(made, surface, state)
-        costs = label_costs(surface, other, transforms, extent=extent)
+        costs = label_costs(surface, other.sight, transforms, extent=extent)
         assert costs.shape == (len(part), 3)
         assert (costs[part == 0].argmin(1) == 0).mean() > 0.8
         assert costs[part == 1].mean(0).argmin() == 1
-        judged = seed_costs(surface, other, transforms, extent)[part == 1].mean(0)
+        judged = seed_costs(surface, other.sight, transforms, extent)[part == 1].mean(0)
         assert judged[0] < 0.8 * judged[1]
 
 
@@ -539,7 +539,7 @@ def test_the_one_moving_part_is_found(kind: Literal["revolute", "prismatic"], de
     )
     assert angle_between(T, T_true) < 1.0
     centre = made.gaussians.means[made.gaussians.part == 1].mean(0).double().numpy()[None]
-    assert np.linalg.norm(moved(centre, T) - moved(centre, T_true)) < 0.01
+    assert np.linalg.norm(moved(centre, T) - moved(centre, T_true)) < 0.015  # A surface is 0.012 thick.
     for labels in found.labels:
         assert labels.shape == (len(made.gaussians),)
         assert (labels == made.gaussians.part.numpy()).mean() > 0.9

@@ -24,9 +24,9 @@ class StereoConfig:
 
     image_size: int = 200
     """Longest side in pixels of the photographs that are compared."""
-    planes: int = 96
+    planes: int = 64
     """Depths tried at each pixel, evenly spaced in inverse depth."""
-    neighbours: int = 8
+    neighbours: int = 6
     """Photographs that each one is compared with, those that look the most alike way."""
     best: int = 2
     """How many of them must show the same: the others may be hidden from."""
@@ -231,9 +231,11 @@ def _match(reference, other, A, b, planes, radius, cost, thread, threads):  # pr
         z = planes[p]
         for y in range(h):
             for x in range(w):
+                raw[y, x] = TRUNCATE
+                if reference[y, x, 3] <= 0.1:
+                    continue
                 u, v = x + 0.5, y + 0.5
                 d = z * (A[2, 0] * u + A[2, 1] * v + A[2, 2]) + b[2]
-                raw[y, x] = TRUNCATE
                 if d < 1e-6:
                     continue
                 s = (z * (A[0, 0] * u + A[0, 1] * v + A[0, 2]) + b[0]) / d - 0.5
