@@ -31,8 +31,8 @@ class Surface:
 
     def blurred(self, k: int = 8) -> np.ndarray:
         """(n, 3) mean colour of each point and its neighbours: what a coarse voxel would show."""
-        index = KDTree(self.points).query(self.points, range(1, min(k, len(self.points)) + 1))[1]
-        return self.colours[index].mean(1)
+        index = np.asarray(KDTree(self.points).query(self.points, min(k, len(self.points)))[1])
+        return self.colours[index.reshape(len(self.points), -1)].mean(1)
 
     @property
     def sheet(self) -> Sheet:
