@@ -19,7 +19,7 @@ from hingesplat import cli
 from hingesplat.errors import HingesplatError
 from hingesplat.export import FORMATS, ExportConfig, export_twin
 from hingesplat.export.check import Check, check_export, simulation, sweep
-from hingesplat.export.links import UP, build_links
+from hingesplat.export.links import UP, build_links, touching
 from hingesplat.export.obj import bake, write_obj
 from hingesplat.export.solids import closed_mesh, collision_hulls, colours, manifold
 from hingesplat.export.splats import read_ply, transformed, write_ply
@@ -650,3 +650,25 @@ def test_every_format_is_written_and_moves_as_a_folder(cabinet: Made, tmp_path: 
             if file.is_file():
                 assert str(tmp_path).encode() not in file.read_bytes()
     assert not list(tmp_path.rglob("*.tmp*"))
+
+
+def test_parts_that_touched_in_a_photographed_state_may_touch(tmp_path: Path) -> None:
+    """Two drawers side by side, one opening while the other closes: their meshes meet in state 1 only."""
+    meshes = {
+        0: box((1, 0.2, 0.2), (0, 0.5, 0), (180, 140, 100)),
+        1: box((0.2, 0.2, 0.2), (-0.2, 0, 0), (200, 40, 40)),
+        2: box((0.2, 0.2, 0.2), (0.2, 0, 0), (40, 40, 200)),
+    }
+    joints = tuple(
+        Joint(i, 0, "prismatic", (x, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, far), (0.0, far))
+        for i, x, far in ((1, 1.0, 0.1), (2, -1.0, 0.1))
+    )
+    twin = Twin(tuple(Part(i, f"p{i}", 5) for i in range(3)), joints)
+    for scale in (1.0, 2.5):
+        links = build_links(twin, meshes, ExportConfig(scale=scale), tmp_path)
+        np.testing.assert_allclose(links[1].pose(1)[:3, 3], [0.1 * scale, 0, 0], atol=1e-12)
+        pairs = {frozenset((a.name, b.name)) for a, b in touching(links)}
+        assert frozenset(("p1", "p2")) in pairs
+    apart = replace(twin, joints=tuple(replace(j, states=(0.0, 0.02)) for j in joints))
+    links = build_links(apart, meshes, ExportConfig(), tmp_path)
+    assert frozenset(("p1", "p2")) not in {frozenset((a.name, b.name)) for a, b in touching(links)}

@@ -60,6 +60,11 @@ class Link:
         low, high = self.joint.limits if self.joint else (0.0, 0.0)
         return low, max(high, low + 1e-4)
 
+    def pose(self, state: int) -> np.ndarray:
+        """4×4 from where the link stands in state 0 to where it stands in ``state``, export's frame."""
+        above = self.parent.pose(state) if self.parent else np.eye(4)
+        return above @ self.joint.transform(self.joint.states[state]) if self.joint else above
+
     def carries(self, other: "Link") -> bool:
         """Whether ``other`` is this link or hangs from it."""
         return other is self or (other.parent is not None and self.carries(other.parent))
@@ -112,10 +117,15 @@ def write_meshes(links: list[Link], out: Path) -> None:
 
 
 def touching(links: list[Link]) -> list[tuple[Link, Link]]:
-    """Pairs that must not collide: parent and child, and links that touch at rest (1 % of the smaller one)."""
+    """Pairs that must not collide: parent and child, and links that touch in a state (1 % of the smaller one).
 
-    def at_rest(link: Link) -> list[trimesh.Trimesh]:
-        return [h.copy().apply_translation(link.origin) for h in link.hulls]
+    The thing itself stood in every state, so where its meshes touch there they are too thick.
+    """
+    states = range(max((len(link.joint.states) for link in links if link.joint), default=1))
+
+    def standing(link: Link, state: int) -> list[trimesh.Trimesh]:
+        placed = link.pose(state) @ trimesh.transformations.translation_matrix(link.origin)
+        return [h.copy().apply_transform(placed) for h in link.hulls]
 
     def gap(a: Link, b: Link) -> float:
         return 0.01 * min(float(link.mesh.extents.max()) for link in (a, b) if link.mesh is not None)
@@ -123,7 +133,9 @@ def touching(links: list[Link]) -> list[tuple[Link, Link]]:
     return [
         (a, b)
         for a, b in combinations(links, 2)
-        if a is b.parent or b is a.parent or (a.hulls and b.hulls and near(at_rest(a), at_rest(b), gap(a, b)))
+        if a is b.parent
+        or b is a.parent
+        or (a.hulls and b.hulls and any(near(standing(a, t), standing(b, t), gap(a, b)) for t in states))
     ]
 
 
@@ -194,7 +206,9 @@ def _link(
         low, high = joint.limits
         axis = R @ np.asarray(joint.axis, float)
         x, y, z = axis / np.linalg.norm(axis)
-        joint = replace(joint, axis=(x, y, z), pivot=tuple(origin), limits=(unit * low, unit * high))
+        states = tuple(unit * value for value in joint.states)
+        limits = (unit * low, unit * high)
+        joint = replace(joint, axis=(x, y, z), pivot=tuple(origin), states=states, limits=limits)
     if solid is None:
         token = np.eye(3) * 1e-6
         return Link(name, part, joint, parent, origin, None, (), 1e-3, np.zeros(3), token)
