@@ -124,7 +124,7 @@ def cells(rows: Sequence[dict[str, Any]]) -> dict[str, str]:
         "CD-m": spread([c["movable_mean"] for c in cd], 2),
         "CD-w": spread([c["whole"] for c in cd], 2),
         "seconds": spread(seconds("total"), 0),
-        "fit s": spread(seconds("fit"), 0),
+        "fit s": spread(seconds("stereo", "fit"), 0),
         "segment s": spread(seconds("segment"), 0),
         "joint s": spread(seconds("fuse", "articulate", "joints"), 0),
         "rest s": spread(seconds("mesh", "export", "pictures"), 0),
