@@ -48,7 +48,9 @@ def call(*args: str) -> str | None:
 
 def results(run: Path) -> dict[str, Any]:
     """What a run says of itself, and what ``evaluate`` says of it."""
-    return {name: json.loads((run / f"{name}.json").read_text()) for name in ("summary", "metrics")}
+    found = {name: json.loads((run / f"{name}.json").read_text()) for name in ("summary", "metrics")}
+    found["metrics"].pop("truth", None)  # A folder of this machine says nothing elsewhere.
+    return found
 
 
 def measure(capture: Path, run: Path, *options: str) -> dict[str, Any]:
