@@ -30,6 +30,11 @@ class Camera:
         return T
 
     @property
+    def K(self) -> np.ndarray:
+        """Camera coordinates to homogeneous pixels, 3×3."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
+
+    @property
     def centre(self) -> np.ndarray:
         """Optical centre in world coordinates, (3,)."""
         return self.T_world_camera[:3, 3]

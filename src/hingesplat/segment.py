@@ -21,7 +21,7 @@ from hingesplat.register import Sheet, register
 from hingesplat.screw import matrix_to_screw
 from hingesplat.search import Motion, ScoreVolume, novelty, scan, score_volume
 from hingesplat.stereo import DepthMap
-from hingesplat.surface import Surface, bounds, surface_of, thin
+from hingesplat.surface import Surface, bounds, free_share, surface_of, thin
 from hingesplat.visibility import COLOUR, FREE, HIDDEN, SURFACE, Sight, ask
 
 Labels = tuple[np.ndarray, np.ndarray]
@@ -246,13 +246,12 @@ def label_costs(
 
     Label 0 is to stay; label k + 1 is to move by ``transforms[k]``, 4×4 from the surface's state to the other.
     """
-    at_home = _free_share(ask(surface.points, surface.colours, surface.sight))
     columns = []
     for T in [None, *transforms]:
         points = surface.points if T is None else moved(surface.points, T)
         answer = ask(points, surface.colours, other)
         # A point a little in front of its surface floats in some photographs of its own state, too.
-        contradiction = np.clip((_free_share(answer) - at_home - 0.02) / 0.2, 0, 1)
+        contradiction = np.clip((free_share(answer) - surface.free_at_home - 0.02) / 0.2, 0, 1)
         # Every surface is hidden from most sides: a few views that see it there are enough.
         arrived = np.clip(answer[:, SURFACE] / ARRIVED, 0, 1)
         colour = np.clip((answer[:, COLOUR] - 0.05) / 0.5, 0, 1)
@@ -261,11 +260,6 @@ def label_costs(
         claim = 0.0 if T is None else 0.05 + far_cost * way * arrived
         columns.append(contradiction + arrived * 0.5 * colour + (1 - arrived) * hidden_cost + claim)
     return np.stack(columns, 1)
-
-
-def _free_share(answer: np.ndarray) -> np.ndarray:
-    """(n,) share of the views that see each point in free space."""
-    return answer[:, FREE] / np.maximum(answer[:, : HIDDEN + 1].sum(1), 1)
 
 
 def seed_costs(

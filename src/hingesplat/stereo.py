@@ -212,12 +212,8 @@ def sweep(picture: Picture, others: Sequence[Picture], planes: np.ndarray, confi
 def _pixel_to_pixel(source: Camera, target: Camera) -> tuple[np.ndarray, np.ndarray]:
     """A (3, 3) and b (3,): the source pixel (u, v) at depth z is at ``z A (u, v, 1) + b`` in target's image, times
     its depth there."""
-
-    def K(c: Camera) -> np.ndarray:
-        return np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]])
-
     T = target.T_camera_world @ source.T_world_camera
-    return K(target) @ T[:3, :3] @ np.linalg.inv(K(source)), K(target) @ T[:3, 3]
+    return target.K @ T[:3, :3] @ np.linalg.inv(source.K), target.K @ T[:3, 3]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)

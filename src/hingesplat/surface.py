@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -34,9 +35,19 @@ class Surface:
         index = np.asarray(KDTree(self.points).query(self.points, min(k, len(self.points)))[1])
         return self.colours[index.reshape(len(self.points), -1)].mean(1)
 
+    @cached_property
+    def free_at_home(self) -> np.ndarray:
+        """(n,) ``free_share`` of the points in their own photographs: fits and stereo stick out a little."""
+        return free_share(ask(self.points, self.colours, self.sight))
+
     @property
     def sheet(self) -> Sheet:
         return Sheet(self.points, self.normals, self.colours)
+
+
+def free_share(answer: np.ndarray) -> np.ndarray:
+    """(n,) share of the views that see each point in free space, from what ``ask`` answers."""
+    return answer[:, FREE] / np.maximum(answer[:, : HIDDEN + 1].sum(1), 1)
 
 
 def bounds(surfaces: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -65,8 +65,7 @@ def look(
         pad = (0, width - camera.width, 0, height - camera.height)
         depth.append(torch.nn.functional.pad(d, pad).numpy())
         rgb.append(torch.nn.functional.pad(picture, pad, value=1.0).permute(1, 2, 0).numpy())
-        K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-        P.append(K @ camera.T_camera_world[:3])
+        P.append(camera.K @ camera.T_camera_world[:3])
     return Sight(
         np.stack(P).astype(np.float32),
         np.ascontiguousarray(np.stack(depth), dtype=np.float32),

@@ -51,6 +51,11 @@ class Link:
         return self.origin if self.parent is None else self.origin - self.parent.origin
 
     @property
+    def moments(self) -> dict[str, float]:
+        """``inertia`` under the names that URDF and SDF share."""
+        return {f"i{'xyz'[r]}{'xyz'[c]}": self.inertia[r, c] for r, c in zip(*np.triu_indices(3), strict=True)}
+
+    @property
     def moves(self) -> bool:
         return self.joint is not None and self.joint.type != "fixed"
 

@@ -49,8 +49,8 @@ def _add_link(model: etree._Element, link: Link) -> None:
     _add(inertial, "pose", [*link.com, 0, 0, 0])
     _add(inertial, "mass", link.mass)
     inertia = etree.SubElement(inertial, "inertia")
-    for name, row, column in (("ixx", 0, 0), ("ixy", 0, 1), ("ixz", 0, 2), ("iyy", 1, 1), ("iyz", 1, 2), ("izz", 2, 2)):
-        _add(inertia, name, link.inertia[row, column])
+    for name, moment in link.moments.items():
+        _add(inertia, name, moment)
     if link.mesh is None:
         return
     _add_mesh(etree.SubElement(element, "visual", name=f"{link.name}_visual"), f"meshes/{link.name}.obj")

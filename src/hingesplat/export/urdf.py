@@ -37,9 +37,7 @@ def _add_link(robot: etree._Element, link: Link) -> None:
     inertial = etree.SubElement(element, "inertial")
     etree.SubElement(inertial, "origin", xyz=numbers(link.com), rpy="0 0 0")
     etree.SubElement(inertial, "mass", value=numbers(link.mass))
-    I = link.inertia
-    moments = {"ixx": I[0, 0], "ixy": I[0, 1], "ixz": I[0, 2], "iyy": I[1, 1], "iyz": I[1, 2], "izz": I[2, 2]}
-    etree.SubElement(inertial, "inertia", **{k: numbers(v) for k, v in moments.items()})
+    etree.SubElement(inertial, "inertia", **{k: numbers(v) for k, v in link.moments.items()})
     if link.mesh is None:
         return
     # Without a material of its own, so that the mesh's texture shows: PyBullet would multiply the two.
