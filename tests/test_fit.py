@@ -58,7 +58,7 @@ def grid(normal: np.ndarray) -> Cloud:
     u = np.linalg.svd(normal[None])[2][1:]
     x, y = (a.ravel() * 0.1 for a in np.meshgrid(np.arange(6), np.arange(6)))
     points = x[:, None] * u[0] + y[:, None] * u[1] + [3.0, 2.0, 1.0]
-    return Cloud(points, np.random.default_rng(0).uniform(0, 1, points.shape), np.tile(normal, (36, 1)))
+    return Cloud(points, np.tile(normal, (36, 1)), np.random.default_rng(0).uniform(0, 1, points.shape))
 
 
 @pytest.mark.parametrize(

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from hingesplat.register import Sheet, normals_of, register
+from hingesplat.register import features, normals_of, register
 from hingesplat.screw import revolute
+from hingesplat.stereo import Cloud
 from scenes import angle_between, sheet, texture
 
 
-def corner(n: int, rng: np.random.Generator) -> Sheet:
+def corner(n: int, rng: np.random.Generator) -> Cloud:
     """Three faces of a unit cube that meet in the origin, textured."""
     points, normals = [], []
     for axis in range(3):
@@ -18,13 +19,13 @@ def corner(n: int, rng: np.random.Generator) -> Sheet:
         points.append(p)
         normals.append(np.broadcast_to(np.eye(3)[axis], p.shape))
     everything = np.concatenate(points)
-    return Sheet(everything, np.concatenate(normals), texture(everything, 3))
+    return Cloud(everything, np.concatenate(normals), texture(everything, 3))
 
 
-def plane(n: int, rng: np.random.Generator) -> Sheet:
+def plane(n: int, rng: np.random.Generator) -> Cloud:
     """One grey face, z = 0."""
     points = np.column_stack([rng.uniform(0, 1, (n, 2)), np.zeros(n)])
-    return Sheet(points, np.tile([0.0, 0, 1], (n, 1)), np.full((n, 3), 0.5))
+    return Cloud(points, np.tile([0.0, 0, 1], (n, 1)), np.full((n, 3), 0.5))
 
 
 def off(degrees: float, shift: list[float]) -> np.ndarray:
@@ -39,10 +40,10 @@ def test_a_small_error_is_undone(same_points: bool) -> None:
     target = corner(1500, rng)
     rows = rng.choice(len(target.points), 400, replace=False)
     fresh = corner(150, rng)
-    taken = Sheet(target.points[rows], target.normals[rows], target.colours[rows]) if same_points else fresh
+    taken = Cloud(target.points[rows], target.normals[rows], target.colours[rows]) if same_points else fresh
     T_true = revolute([0, 0, 1], [0, 0, 0], 0.5)
     moved = target.points @ T_true[:3, :3].T
-    there = Sheet(moved, target.normals @ T_true[:3, :3].T, target.colours)
+    there = Cloud(moved, target.normals @ T_true[:3, :3].T, target.colours)
     start = off(3.0, [0.012, -0.012, 0.01]) @ T_true
     T = register(taken, there, start, 1.0)
     assert angle_between(start, T_true) > 2.9
@@ -80,7 +81,7 @@ def test_directions_that_nothing_constrains_stay() -> None:
 def test_texture_holds_a_plane_that_could_slide() -> None:
     rng = np.random.default_rng(4)
     grey = plane(4000, rng)
-    painted = Sheet(grey.points, grey.normals, texture(grey.points, 5))
+    painted = Cloud(grey.points, grey.normals, texture(grey.points, 5))
     start = np.eye(4)
     start[:2, 3] = 0.015, -0.01
     T = register(painted, painted, start, 1.0)
@@ -93,13 +94,13 @@ def test_a_panel_comes_to_lie_on_the_side_it_shows(side: float) -> None:
     rng = np.random.default_rng(8)
     thickness = 0.02
     front, back = plane(4000, rng), plane(4000, rng)
-    target = Sheet(
+    target = Cloud(
         np.concatenate([front.points, back.points - [0, 0, thickness]]),
         np.concatenate([front.normals, -back.normals]),
         np.concatenate([front.colours, back.colours]),
     )
     seen = plane(400, rng)
-    source = Sheet(seen.points, side * seen.normals, seen.colours)
+    source = Cloud(seen.points, side * seen.normals, seen.colours)
     right, wrong = (0.0, -thickness) if side > 0 else (-thickness, 0.0)
     start = np.eye(4)
     start[2, 3] = wrong
@@ -110,14 +111,14 @@ def test_a_panel_comes_to_lie_on_the_side_it_shows(side: float) -> None:
 def test_features_turn_with_the_sheet() -> None:
     sheet_ = corner(50, np.random.default_rng(9))
     T = revolute([1.0, 2.0, 0.5], [0.3, 0, 0], 0.8)
-    moved = Sheet(sheet_.points @ T[:3, :3].T + T[:3, 3], sheet_.normals @ T[:3, :3].T, sheet_.colours)
-    np.testing.assert_allclose(sheet_.features(T, 2.0), moved.features(np.eye(4), 2.0), atol=1e-12)
+    moved = Cloud(sheet_.points @ T[:3, :3].T + T[:3, 3], sheet_.normals @ T[:3, :3].T, sheet_.colours)
+    np.testing.assert_allclose(features(sheet_, T, 2.0), features(moved, np.eye(4), 2.0), atol=1e-12)
 
 
 def test_too_few_pairs_leave_the_motion_alone() -> None:
     rng = np.random.default_rng(5)
     target = corner(300, rng)
-    few = Sheet(target.points[:11], target.normals[:11], target.colours[:11])
+    few = Cloud(target.points[:11], target.normals[:11], target.colours[:11])
     start = off(2.0, [0.01, 0, 0])
     assert np.array_equal(register(few, target, start, 1.0), start)
     far = np.eye(4)
@@ -129,7 +130,7 @@ def test_outliers_are_trimmed() -> None:
     rng = np.random.default_rng(6)
     target = corner(1000, rng)
     junk = rng.uniform(0.1, 0.9, (600, 3))
-    source = Sheet(
+    source = Cloud(
         np.concatenate([target.points[::2], junk]),
         np.concatenate([target.normals[::2], np.tile([0.0, 0, 1], (600, 1))]),
         np.concatenate([target.colours[::2], rng.uniform(0, 1, (600, 3))]),

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from hingesplat.gaussians import concatenate
-from hingesplat.register import Sheet
 from hingesplat.render import render
 from hingesplat.screw import prismatic, revolute
 from hingesplat.search import Motion
@@ -37,7 +36,7 @@ from hingesplat.segment import (
     survey,
     track,
 )
-from hingesplat.stereo import DepthMap, StereoConfig, depth_map, stereo
+from hingesplat.stereo import Cloud, DepthMap, StereoConfig, depth_map, stereo
 from hingesplat.surface import Surface, bounds, surface_of, thin
 from hingesplat.visibility import FREE, HIDDEN, SURFACE, Sight, ask
 from scenes import (
@@ -421,14 +420,14 @@ def test_registered_keeps_the_kind_and_the_sign(turned: Turned) -> None:
     mine = first.rows(np.flatnonzero(parts_of(made, first) == 1)[::3])
     for sign in (1.0, -1.0):
         start = Motion("revolute", sign * AXIS, PIVOT + 0.01, sign * (ANGLE + 0.04), 0.5)
-        fitted = registered(start, mine.sheet, second.sheet, extent)
+        fitted = registered(start, mine.cloud, second.cloud, extent)
         assert fitted.kind == "revolute"
         assert fitted.axis @ start.axis > 0.99
         assert fitted.value == pytest.approx(sign * ANGLE, abs=0.005)
-    slid = Sheet(mine.points + SLIDE * FORWARD, mine.normals, mine.colours)
+    slid = Cloud(mine.points + SLIDE * FORWARD, mine.normals, mine.colours)
     for sign in (1.0, -1.0):
         start = Motion("prismatic", sign * FORWARD, PIVOT, sign * (SLIDE - 0.01), 0.5)
-        fitted = registered(start, mine.sheet, slid, extent)
+        fitted = registered(start, mine.cloud, slid, extent)
         assert fitted.kind == "prismatic"
         np.testing.assert_allclose(fitted.axis * fitted.value, SLIDE * FORWARD, atol=0.002)
 
@@ -436,9 +435,9 @@ def test_registered_keeps_the_kind_and_the_sign(turned: Turned) -> None:
 def test_registering_a_slide_of_nothing_is_no_error(turned: Turned) -> None:
     _, (first, _), extent = turned
     still = replace(PULL, value=0.0)
-    np.testing.assert_allclose(registered(still, first.sheet, first.sheet, extent).T, np.eye(4), atol=1e-6)
+    np.testing.assert_allclose(registered(still, first.cloud, first.cloud, extent).T, np.eye(4), atol=1e-6)
     few = first.rows(np.arange(5))  # Too few to register at all.
-    np.testing.assert_array_equal(registered(still, few.sheet, first.sheet, extent).T, np.eye(4))
+    np.testing.assert_array_equal(registered(still, few.cloud, first.cloud, extent).T, np.eye(4))
 
 
 def test_pieces_far_apart_become_parts_with_one_motion() -> None:

@@ -122,7 +122,7 @@ def test_rows_are_seen_by_the_same_cameras_and_make_a_sheet() -> None:
     assert few.sight is s.sight and len(few.points) == 15
     for name in ("points", "colours", "normals"):
         np.testing.assert_array_equal(getattr(few, name), getattr(s, name)[:100:7])
-        assert getattr(few.sheet, name) is getattr(few, name)
+        assert getattr(few.cloud, name) is getattr(few, name)
 
 
 def test_blurred_is_the_mean_of_neighbours() -> None:

@@ -1,13 +1,12 @@
 """Trimmed point-to-plane registration: a motion that is roughly right made right to a fraction of a degree."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from hingesplat.gaussians import Gaussians
 from hingesplat.se3 import wxyz_to_matrix
+from hingesplat.stereo import Cloud
 
 COLOUR_LENGTH = 0.08
 """A difference of 1 in colour counts as this fraction of the extent."""
@@ -15,27 +14,16 @@ NORMAL_LENGTH = 0.03
 """The same for a difference of 1 between normals: the two sides of a panel are two sheets."""
 
 
-@dataclass(frozen=True)
-class Sheet:
-    """Surface points with normals and colours, ready to be registered against."""
-
-    points: np.ndarray
-    """(n, 3)"""
-    normals: np.ndarray
-    """(n, 3) unit, towards whoever sees the surface."""
-    colours: np.ndarray
-    """(n, 3)"""
-
-    def features(self, T: np.ndarray, extent: float) -> np.ndarray:
-        """(n, 9) what has to be alike for two points to be one, after T: place, colour, side of the sheet."""
-        return np.concatenate(
-            [
-                self.points @ T[:3, :3].T + T[:3, 3],
-                self.colours * (COLOUR_LENGTH * extent),
-                self.normals @ T[:3, :3].T * (NORMAL_LENGTH * extent),
-            ],
-            1,
-        )
+def features(cloud: Cloud, T: np.ndarray, extent: float) -> np.ndarray:
+    """(n, 9) what has to be alike for two points to be one, after T: place, colour, side of the sheet."""
+    return np.concatenate(
+        [
+            cloud.points @ T[:3, :3].T + T[:3, 3],
+            cloud.colours * (COLOUR_LENGTH * extent),
+            cloud.normals @ T[:3, :3].T * (NORMAL_LENGTH * extent),
+        ],
+        1,
+    )
 
 
 def normals_of(gaussians: Gaussians) -> np.ndarray:
@@ -46,8 +34,8 @@ def normals_of(gaussians: Gaussians) -> np.ndarray:
 
 
 def register(
-    source: Sheet,
-    target: Sheet,
+    source: Cloud,
+    target: Cloud,
     T: np.ndarray,
     extent: float,
     *,
@@ -62,10 +50,10 @@ def register(
     shrinking radius (fractions of the extent) are left out; directions that no pair constrains stay as they are.
     Without ``turn`` the rotation stays as it is.
     """
-    tree = KDTree(target.features(np.eye(4), extent))
+    tree = KDTree(features(target, np.eye(4), extent))
     for i in range(iterations):
         radius = extent * start_radius * (end_radius / start_radius) ** (i / max(iterations - 1, 1))
-        moved = source.features(T, extent)
+        moved = features(source, T, extent)
         distance, index = map(np.asarray, tree.query(moved))
         near = distance < radius
         if near.sum() < 12:

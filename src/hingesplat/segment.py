@@ -17,10 +17,10 @@ from scipy.spatial import KDTree
 
 from hingesplat.capture import View
 from hingesplat.gaussians import Gaussians
-from hingesplat.register import Sheet, register
+from hingesplat.register import register
 from hingesplat.screw import matrix_to_screw
 from hingesplat.search import Motion, ScoreVolume, novelty, scan, score_volume
-from hingesplat.stereo import DepthMap
+from hingesplat.stereo import Cloud, DepthMap
 from hingesplat.surface import Surface, bounds, free_share, surface_of, thin
 from hingesplat.visibility import COLOUR, FREE, HIDDEN, SURFACE, Sight, ask
 
@@ -695,9 +695,9 @@ def _refit(
         fit = polished([start, near], mine, fresh[1 - s], extent)
         return fit if s == 0 else inverted(fit)
     # Against the whole of the other state a drawer would cling to the frame that it slides along.
-    target = surfaces[1 - s].rows(own[1 - s]).sheet
-    once = registered(start, mine.sheet, target, extent)
-    trials = [start, once, registered(once, mine.sheet, target, extent)]
+    target = surfaces[1 - s].rows(own[1 - s]).cloud
+    once = registered(start, mine.cloud, target, extent)
+    trials = [start, once, registered(once, mine.cloud, target, extent)]
 
     def best(motions: Sequence[Motion]) -> Motion:
         there = seed_costs(mine, surfaces[1 - s].sight, [m.T for m in motions], extent, 0.0).sum(0)
@@ -721,11 +721,11 @@ def polished(trials: Sequence[Motion], mine: Surface, other: Surface, extent: fl
         costs = seed_costs(mine, other.sight, [m.T for m in motions], extent, 0.0)
         return motions[int(costs.mean(0).argmin())]
 
-    motion = best([*trials, *(registered(m, mine.sheet, other.sheet, extent) for m in trials)])
+    motion = best([*trials, *(registered(m, mine.cloud, other.cloud, extent) for m in trials)])
     return best(values_around(motion, extent))
 
 
-def registered(motion: Motion, source: Sheet, target: Sheet, extent: float) -> Motion:
+def registered(motion: Motion, source: Cloud, target: Cloud, extent: float) -> Motion:
     """The motion after registration, of the same kind again: what another degree of freedom took up is dropped."""
     T = register(source, target, motion.T, extent, turn=motion.kind == "revolute")
     centroid = source.points.mean(0)

@@ -73,10 +73,10 @@ class Cloud:
 
     points: np.ndarray
     """(n, 3) world frame."""
-    colours: np.ndarray
-    """(n, 3)"""
     normals: np.ndarray
     """(n, 3) unit, towards the cameras where it is known which see the point."""
+    colours: np.ndarray
+    """(n, 3)"""
 
     def __len__(self) -> int:
         return len(self.points)
@@ -84,14 +84,14 @@ class Cloud:
     @staticmethod
     def of(points: np.ndarray) -> "Cloud":
         """Grey points (n, 3), their normals guessed from their neighbours."""
-        return Cloud(points, np.full(points.shape, 0.5), normals_by_neighbours(points))
+        return Cloud(points, normals_by_neighbours(points), np.full(points.shape, 0.5))
 
     def joined(self, other: "Cloud") -> "Cloud":
         pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(Cloud))
         return Cloud(*map(np.concatenate, pairs))
 
     def rows(self, index: np.ndarray) -> "Cloud":
-        return Cloud(self.points[index], self.colours[index], self.normals[index])
+        return Cloud(self.points[index], self.normals[index], self.colours[index])
 
 
 def stereo(views: Sequence[View], config: StereoConfig) -> list[DepthMap]:
@@ -147,7 +147,7 @@ def fused(maps: Sequence[DepthMap], size: float) -> Cloud:
     mean = (np.stack(columns, 1) / count[:, None])[count >= 2]
     normals = normals_by_neighbours(mean[:, :3])
     normals *= np.where((normals * mean[:, 6:]).sum(1, keepdims=True) < 0, -1, 1)
-    return Cloud(mean[:, :3], mean[:, 3:6], normals)
+    return Cloud(mean[:, :3], normals, mean[:, 3:6])
 
 
 def normals_by_neighbours(points: np.ndarray, k: int = 12) -> np.ndarray:

@@ -9,8 +9,8 @@ from scipy.spatial import KDTree
 
 from hingesplat.capture import View
 from hingesplat.gaussians import SH_C0, Gaussians
-from hingesplat.register import Sheet, normals_of
-from hingesplat.stereo import DepthMap, fused, seen_through
+from hingesplat.register import normals_of
+from hingesplat.stereo import Cloud, DepthMap, fused, seen_through
 from hingesplat.visibility import FREE, HIDDEN, SURFACE, Sight, ask, look
 
 
@@ -41,8 +41,8 @@ class Surface:
         return free_share(ask(self.points, self.colours, self.sight))
 
     @property
-    def sheet(self) -> Sheet:
-        return Sheet(self.points, self.normals, self.colours)
+    def cloud(self) -> Cloud:
+        return Cloud(self.points, self.normals, self.colours)
 
 
 def free_share(answer: np.ndarray) -> np.ndarray:
@@ -83,12 +83,8 @@ def surface_of(
     alone = (gaussians.opacities.numpy() > 0.2) & (seen_through(points, maps, 2 * tolerance) < 2)
     if len(cloud):
         alone &= KDTree(cloud.points).query(points)[0] > 2 * spacing
-    surface = Surface(
-        np.concatenate([cloud.points, points[alone]]),
-        np.concatenate([cloud.colours, colours[alone]]),
-        np.concatenate([cloud.normals, normals_of(gaussians)[alone]]),
-        sight,
-    )
+    cloud = cloud.joined(Cloud(points[alone], normals_of(gaussians)[alone], colours[alone]))
+    surface = Surface(cloud.points, cloud.colours, cloud.normals, sight)
     answer = ask(surface.points, surface.colours, sight)
     views_of_it = answer[:, : HIDDEN + 1].sum(1)
     return surface.rows(np.flatnonzero((answer[:, SURFACE] >= 2) & (answer[:, FREE] <= 0.15 * views_of_it)))
