@@ -6,10 +6,12 @@ judge of every motion hypothesis: the other state's pictures, never point matche
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
 from numba import njit
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from hingesplat.camera import Camera
 from hingesplat.capture import View
@@ -34,6 +36,18 @@ class Sight:
     """(v, h, w, 3) float32 photograph over white."""
     tolerance: float
     """Half-width of the band around the surface, scene units."""
+
+    @cached_property
+    def reach(self) -> np.ndarray:
+        """(v, h, w, 2) float32 least and greatest known depth of the pixel and its eight neighbours.
+
+        Both are infinite where all nine lie off the object, so that any point there is in front; both are 0 where
+        nothing is known.
+        """
+        near = minimum_filter(np.where(self.depth > 0, self.depth, np.inf), (1, 3, 3))
+        far = maximum_filter(np.maximum(self.depth, 0), (1, 3, 3))
+        off = minimum_filter(self.depth == 0, (1, 3, 3))
+        return np.stack([np.where((far > 0) | off, near, 0), np.where(off, np.inf, far)], -1).astype(np.float32)
 
 
 @torch.no_grad()
@@ -90,16 +104,14 @@ def _corrected(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _ask(points, colours, P, depth, rgb, tolerance, answer, thread, threads):  # pragma: no cover - compiled
+def _ask(points, colours, P, depth, reach, rgb, tolerance, answer, thread, threads):  # pragma: no cover - compiled
     views, height, width = depth.shape
-    for i in range(thread, points.shape[0], threads):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        free = 0.0
-        surface = 0.0
-        hidden = 0.0
-        difference = 0.0
-        for v in range(views):
-            p = P[v]
+    answer[thread::threads] = 0
+    # One picture after the other, so that it stays in the cache.
+    for v in range(views):
+        p = P[v]
+        for i in range(thread, points.shape[0], threads):
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
             d = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
             if d < 1e-3:
                 continue
@@ -108,21 +120,23 @@ def _ask(points, colours, P, depth, rgb, tolerance, answer, thread, threads):  #
             if u < 1 or w < 1 or u >= width - 1 or w >= height - 1:
                 continue
             # The best of nine pixels decides, so that an edge or a speckle one pixel off is no contradiction.
-            off = 0
+            near, far = reach[v, w, u, 0], reach[v, w, u, 1]
+            if d <= near - tolerance:
+                answer[i, FREE] += 1
+                continue
+            if d >= far + tolerance:
+                answer[i, HIDDEN] += far > 0  # 0: nothing is known.
+                continue
             least = np.float32(1e9)
             signed = np.float32(0)
             for b in range(-1, 2):
                 for a in range(-1, 2):
                     s = depth[v, w + b, u + a]
-                    if s == 0:
-                        off += 1
-                    elif s > 0 and abs(d - s) < least:
+                    if s > 0 and abs(d - s) < least:
                         least = abs(d - s)
                         signed = d - s
-            if off == 9:
-                free += 1
-            elif least < tolerance:
-                surface += 1
+            if least < tolerance:
+                answer[i, SURFACE] += 1
                 closest = np.float32(3)
                 for b in range(-1, 2):
                     for a in range(-1, 2):
@@ -130,16 +144,13 @@ def _ask(points, colours, P, depth, rgb, tolerance, answer, thread, threads):  #
                         e1 = rgb[v, w + b, u + a, 1] - colours[i, 1]
                         e2 = rgb[v, w + b, u + a, 2] - colours[i, 2]
                         closest = min(closest, e0 * e0 + e1 * e1 + e2 * e2)
-                difference += np.sqrt(closest)
-            elif least < 1e8:
-                if signed < -tolerance:
-                    free += 1
-                else:
-                    hidden += 1
-        answer[i, 0] = free
-        answer[i, 1] = surface
-        answer[i, 2] = hidden
-        answer[i, 3] = difference / surface if surface > 0 else 0.0
+                answer[i, COLOUR] += np.sqrt(closest)
+            elif signed < 0:
+                answer[i, FREE] += 1
+            else:
+                answer[i, HIDDEN] += 1
+    for i in range(thread, points.shape[0], threads):
+        answer[i, COLOUR] /= max(answer[i, SURFACE], np.float32(1))
 
 
 def ask(points: np.ndarray, colours: np.ndarray, sight: Sight) -> np.ndarray:
@@ -157,6 +168,7 @@ def ask(points: np.ndarray, colours: np.ndarray, sight: Sight) -> np.ndarray:
         np.ascontiguousarray(colours, dtype=np.float32),
         sight.P,
         sight.depth,
+        sight.reach,
         sight.rgb,
         np.float32(sight.tolerance),
         answer,
