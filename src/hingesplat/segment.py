@@ -39,6 +39,9 @@ PROMISING = 0.6
 ARRIVED = 4
 """Views that must see a surface where a motion takes a point, for the point to have been seen there."""
 
+UNEXPLAINED = 0.35
+"""What a point costs at most when motions are chosen: a little more than one that a motion hides."""
+
 HIDDEN_SEED_COST = 0.4
 """Cost of a seed that a motion takes out of everybody's sight."""
 
@@ -65,7 +68,7 @@ class SegmentConfig:
     """A seed agrees with a motion that costs it less than this."""
     consensus_motions: int = 50
     """Hypotheses that are refined on all seeds that agree with them."""
-    part_cost: float = 45.0
+    part_cost: float = 30.0
     """Description length of one more part, in points (a point stands for 0.03² of the extent's square)."""
     min_part_seeds: int = 25
     """A part must own at least this many seeds."""
@@ -110,11 +113,22 @@ def floating(answer: np.ndarray) -> np.ndarray:
     return (answer[:, FREE] >= 3) & (answer[:, FREE] > 0.15 * answer[:, : HIDDEN + 1].sum(1))
 
 
-def components(points: np.ndarray, radius: float) -> np.ndarray:
-    """(n,) label of the connected piece each point belongs to, neighbours being closer than ``radius``."""
+def components(points: np.ndarray, radius: float, *, bridges: bool = True) -> np.ndarray:
+    """(n,) label of the connected piece each point belongs to, neighbours being closer than ``radius``.
+
+    Without ``bridges``, points with less than half the usual number of neighbours connect nothing: each only joins
+    the nearest that has more.
+    """
     if len(points) == 0:
         return np.zeros(0, int)
-    pairs = KDTree(points).query_pairs(radius, output_type="ndarray")
+    tree = KDTree(points)
+    pairs = tree.query_pairs(radius, output_type="ndarray")
+    if not bridges:
+        degree = np.bincount(pairs.ravel(), minlength=len(points))
+        dense = 2 * degree >= np.median(degree)
+        distance, nearest = map(np.asarray, KDTree(points[dense]).query(points[~dense]))
+        joins = np.column_stack([np.flatnonzero(~dense), np.flatnonzero(dense)[nearest]])
+        pairs = np.concatenate([pairs[dense[pairs].all(1)], joins[distance < radius]])
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
     return connected_components(graph, directed=False)[1]
 
@@ -347,13 +361,15 @@ class Labelling:
         """(points of both states, 1 + motions) costs, each the mean over a point and its neighbours.
 
         A point that a motion brings onto a surface asks that surface, too, how much it would rather be another's.
+        None costs more than ``UNEXPLAINED``: else a motion would pay that only takes what nothing explains out of
+        sight.
         """
         costs, partners = self.costs(T_1_0), self.partners(T_1_0)
         result = []
         for s in (0, 1):
             regret = costs[1 - s] - costs[1 - s].min(1, keepdims=True)
             there = np.take_along_axis(regret, np.maximum(partners[s], 0), 0)
-            both = np.minimum(costs[s] + np.where(partners[s] >= 0, 0.5 * there, 0), 1.2)
+            both = np.minimum(costs[s] + np.where(partners[s] >= 0, 0.5 * there, 0), UNEXPLAINED)
             average = self.weights[s] + identity(len(both))
             average = average.multiply(1 / average.sum(1)).tocsr()
             result.append(average @ (average @ both))
@@ -446,7 +462,7 @@ def segment(
 
     rows = [thin(surface.points, 2 * config.spacing * extent, rng) for surface in surfaces]
     problem = Labelling.of((surfaces[0].rows(rows[0]), surfaces[1].rows(rows[1])), extent)
-    kept = eliminate(problem.smoothed([m.T for m in chosen]), config.part_cost / 3, parts)
+    kept = eliminate(problem.smoothed([m.T for m in chosen]), config.part_cost / 2, parts)
     chosen = [chosen[k - 1] for k in kept]
     for _ in range(config.rounds):
         kept, owned = problem.solve([m.T for m in chosen], config.part_cost, parts)
@@ -489,7 +505,8 @@ def split_pieces(
     result: list[Motion] = []
     labels = (np.zeros_like(owned[0]), np.zeros_like(owned[1]))
     for k, motion in enumerate(motions):
-        rows, piece = _pieces(k + 1, motion.T, owned, surfaces, extent)
+        # Two doors edge to edge are linked by a few points at most.
+        rows, piece = _pieces(k + 1, motion.T, owned, surfaces, extent, bridges=False)
         each = [np.bincount(p, minlength=max(int(q.max(initial=0)) for q in piece) + 1) for p in piece]
         size = each[0] + each[1]
         # A part is seen in both states; what is seen in one only is the inside of something.
@@ -553,12 +570,18 @@ def reattach_fragments(
 
 
 def _pieces(
-    label: int, T_1_0: np.ndarray, owned: Labels, surfaces: tuple[Surface, Surface], extent: float
+    label: int,
+    T_1_0: np.ndarray,
+    owned: Labels,
+    surfaces: tuple[Surface, Surface],
+    extent: float,
+    *,
+    bridges: bool = True,
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Rows of one part's points in each state, and the connected piece of each, both states laid over each other."""
     rows = [np.flatnonzero(o == label) for o in owned]
     both = np.concatenate([moved(surfaces[0].points[rows[0]], T_1_0), surfaces[1].points[rows[1]]])
-    piece = components(both, max(0.025 * extent, 2.5 * spacing(both)))
+    piece = components(both, max(0.025 * extent, 2.5 * spacing(both)), bridges=bridges)
     return rows, np.split(piece, [len(rows[0])])
 
 
