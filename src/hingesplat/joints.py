@@ -16,7 +16,7 @@ from hingesplat.optim import GaussianAdam, LearningRates
 from hingesplat.poses import StateLossConfig, draw_state, part_centres, state_loss
 from hingesplat.screw import matrix_to_screw
 from hingesplat.se3 import rotvec_to_matrix
-from hingesplat.training import Report, TrainingView, averaged, four_planes, shuffled, training_view
+from hingesplat.training import Report, TrainingView, averaged, shuffled, training_view
 from hingesplat.twin import Joint, JointStd, JointType
 
 log = logging.getLogger(__name__)
@@ -161,11 +161,11 @@ def find_joints(
         progress = step / config.steps
         state, view = next(photographs)
         R, t = poses.Rt()
-        loss, image = state_loss(optimiser, R[state], t[state], view, state, config.render, extent)
+        loss, error = state_loss(optimiser, R[state], t[state], view, state, config.render, extent)
         loss.backward()
         optimiser.step(progress)
         _joint_step(adam, config.rate, progress)
-        tell(loss, image, view, len(optimiser))
+        tell(loss, error, len(optimiser))
     finished = optimiser.gaussians.detached()
     offsets = optimiser.values["state_sh"].detach().permute(1, 0, 2)
     all_sh = torch.cat([torch.zeros_like(offsets[:1]), offsets]).contiguous()
@@ -187,7 +187,7 @@ def _picture_loss(
 ) -> Tensor:
     R, t = poses.Rt()
     r = draw_state(g, R[state], t[state], view.camera, sh_offset=sh[state], background=torch.ones(3))
-    return photometric(four_planes(r), view.target, config.render.ssim_weight)
+    return photometric(r.rgba, view.target, config.render.ssim_weight)
 
 
 def _choose_types(
@@ -245,7 +245,7 @@ def _losses_by_part(
     for s in range(1, len(training)):
         for view in training[s]:
             r = draw_state(g, R[s], t[s], view.camera, sh_offset=sh[s], background=torch.ones(3), channels=membership)
-            error = (four_planes(r) - view.image).abs().mean(0)
+            error = (r.rgba - view.image).abs().mean(0)
             region = torch.nn.functional.max_pool2d(r.channels[None], 15, 1, 7)[0] > 0.3
             area = region.flatten(1).sum(1)
             mean = (error * region).flatten(1).sum(1) / area.clamp_min(1)
