@@ -246,7 +246,8 @@ def _losses_by_part(
         for view in training[s]:
             r = draw_state(g, R[s], t[s], view.camera, sh_offset=sh[s], background=torch.ones(3), channels=membership)
             error = (r.rgba - view.image).abs().mean(0)
-            region = torch.nn.functional.max_pool2d(r.channels[None], 15, 1, 7)[0] > 0.3
+            tall = torch.nn.functional.max_pool2d(r.channels[None], (15, 1), 1, (7, 0))
+            region = torch.nn.functional.max_pool2d(tall, (1, 15), 1, (0, 7))[0] > 0.3
             area = region.flatten(1).sum(1)
             mean = (error * region).flatten(1).sum(1) / area.clamp_min(1)
             rows.append(torch.where(area > 30, mean, torch.nan).numpy())
