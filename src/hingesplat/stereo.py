@@ -235,7 +235,7 @@ def _match(reference, other, A, b, planes, radius, cost, thread, threads):  # pr
     """Mean truncated colour difference of the patches around each pixel, for each depth: (planes, h, w)."""
     h, w = cost.shape[1:]
     height, width = other.shape[:2]
-    one, half = np.float32(1), np.float32(0.5)
+    one, half, slack = np.float32(1), np.float32(0.5), np.float32(1e-3)
     raw = np.empty((h, w), np.float32)
     summed = np.empty((h + 1, w + 1), np.float32)
     for p in range(thread, len(planes), threads):
@@ -251,7 +251,7 @@ def _match(reference, other, A, b, planes, radius, cost, thread, threads):  # pr
                     continue
                 s = (z * (A[0, 0] * u + A[0, 1] * v + A[0, 2]) + b[0]) / d - half
                 t = (z * (A[1, 0] * u + A[1, 1] * v + A[1, 2]) + b[1]) / d - half
-                if s < 0 or t < 0 or s >= width - 1 or t >= height - 1:
+                if s < -slack or t < -slack or s >= width - 1 or t >= height - 1:
                     continue
                 i, j = int(s), int(t)
                 f, g = s - np.float32(i), t - np.float32(j)
@@ -314,7 +314,7 @@ def confirmed(index: int, maps: Sequence[DepthMap], tolerance: float, agree: int
     m = maps[index]
     y, x = np.nonzero(m.depth > 0)
     points = m.camera.lifted(x, y, m.depth[y, x])
-    same, through = _votes(points, [other for other in maps if other is not m], tolerance)
+    same, through = _votes(points, [*maps[:index], *maps[index + 1 :]], tolerance)
     keep = (same >= agree) & (same >= 0.5 * through)
     depth = np.zeros_like(m.depth)
     depth[y[keep], x[keep]] = m.depth[y[keep], x[keep]]
