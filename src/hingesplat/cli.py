@@ -379,8 +379,9 @@ class StageProgress:
                 self.tasks[label] = self.tasks.pop(stage)
                 self.progress.update(self.tasks[label], description=label)
             else:
-                for task in self.tasks.values():
-                    self._finish(task)
+                for name, task in self.tasks.items():
+                    if name.split()[0] != stage:  # States are fitted at once.
+                        self._finish(task)
                 self.tasks[label] = self.progress.add_task(label, total=None, numbers="")
         if "steps" in numbers:
             self.progress.update(
