@@ -27,7 +27,7 @@ from hingesplat.training import Report, averaged, grow, shuffled, training_view
 class ArticulateConfig:
     """Joint optimisation. Weights of the paper's terms are its λ; 0 leaves a term out."""
 
-    steps: int = 1500
+    steps: int = 1000
     """Optimiser steps, each on one photograph of one state."""
     max_gaussians: int = 16_000
     """Cap on the number of canonical Gaussians."""
@@ -62,7 +62,7 @@ class ArticulateConfig:
     """Push movable Gaussians off repel points on the base (eq. 14)."""
     repel_points: int = 2000
     """N_R."""
-    rates: LearningRates = field(default_factory=lambda: LearningRates(means=1e-3))
+    rates: LearningRates = field(default_factory=lambda: LearningRates(means=2e-3))
 
 
 @dataclass(frozen=True)

@@ -274,7 +274,7 @@ def demo_config() -> "ReconstructConfig":
     config = ReconstructConfig()
     return replace(
         config,
-        fit=replace(config.fit, steps=1200, start_gaussians=3000, max_gaussians=8000),
+        fit=replace(config.fit, steps=1000, start_gaussians=3000, max_gaussians=8000),
         articulate=replace(config.articulate, steps=1500, max_gaussians=16_000),
         mesh=replace(config.mesh, views=32, image_size=200),
     )

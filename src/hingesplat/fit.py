@@ -38,7 +38,7 @@ FREE = 0.2
 class FitConfig:
     """One state's Gaussians."""
 
-    steps: int = 1500
+    steps: int = 1000
     """Optimiser steps."""
     start_gaussians: int = 4000
     """Gaussians at the start, on known depth and on the visual hull's shell."""

@@ -34,7 +34,7 @@ class JointsConfig:
     """It must also lower the error around the part by this fraction: more numbers always fit a little better."""
     hinge_reach: float = 1.0
     """A hinge line farther than this from its part, in extents, is a slide in disguise."""
-    steps: int = 400
+    steps: int = 500
     """Steps of the constrained refinement, everything together."""
     rate: float = 1e-3
     """Adam step of the joint parameters (radians, extents) at the start; decays to 2 %."""
@@ -42,7 +42,7 @@ class JointsConfig:
     """Photographs of each moved state from which standard deviations are made; 0 skips them."""
     render: StateLossConfig = field(default_factory=StateLossConfig)
     rates: LearningRates = field(
-        default_factory=lambda: LearningRates(means=3e-4, quats=1e-3, log_scales=2e-3, logit_opacities=1e-2, sh=3e-3)
+        default_factory=lambda: LearningRates(means=6e-4, quats=2e-3, log_scales=4e-3, logit_opacities=2e-2, sh=6e-3)
     )
 
 
@@ -222,9 +222,11 @@ def _choose_types(
     for j in range(n_joints):
         difference = losses["prismatic"][:, j] - losses["revolute"][:, j]
         difference = difference[np.isfinite(difference)]
-        error = difference.std() / math.sqrt(max(len(difference), 1)) + 1e-12
-        z = float(difference.mean() / error) if len(difference) else 0.0
-        gain = float(difference.mean() / np.nanmean(losses["prismatic"][:, j])) if len(difference) else 0.0
+        z = gain = 0.0
+        if len(difference):  # Photographs that show the part with both.
+            error = difference.std() / math.sqrt(len(difference)) + 1e-12
+            z = float(difference.mean() / error)
+            gain = float(difference.mean() / np.nanmean(losses["prismatic"][:, j]))
         hinged = z > config.type_significance and gain > config.type_gain and float(reach[j]) < config.hinge_reach
         log.debug("joint %d: z %.1f, gain %.3f, reach %.2f", j + 1, z, gain, float(reach[j]))
         kinds.append("revolute" if hinged else "prismatic")

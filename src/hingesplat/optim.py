@@ -20,15 +20,15 @@ PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh")
 class LearningRates:
     """Adam step sizes at the start; means are in units of the object's extent."""
 
-    means: float = 2e-3
+    means: float = 4e-3
     """Centres, times the extent; decays to 1 % over the run."""
-    quats: float = 5e-3
+    quats: float = 1e-2
     """Orientations; this and the rest decay to 10 %."""
-    log_scales: float = 1e-2
+    log_scales: float = 2e-2
     """Log standard deviations."""
     logit_opacities: float = 5e-2
     """Opacity logits."""
-    sh: float = 1e-2
+    sh: float = 2e-2
     """Spherical-harmonic coefficients (constant term; the others get a tenth)."""
 
 
