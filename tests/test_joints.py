@@ -9,7 +9,8 @@ import torch
 from torch.autograd import gradcheck
 
 from hingesplat.joints import JointPoses, JointResult, JointsConfig, _joints, closest_joint, find_joints
-from hingesplat.poses import move, part_centres
+from hingesplat.poses import part_centres
+from hingesplat.render import move
 from hingesplat.screw import line_distance, prismatic, revolute
 from scenes import (
     ANGLE,

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from hingesplat.losses.photometric import Target, photometric, psnr, ssim, ssim_map
+from hingesplat.losses.photometric import Target, photometric, picture_loss, psnr, ssim, ssim_map
 
 
 def pair(channels=3, height=40, width=30, seed=0, dtype=torch.float32):
@@ -33,6 +33,29 @@ def test_the_fused_kernel_agrees_with_torch_in_float64(size, weight):
     exact, truth = value_and_gradient(x.double(), y.double(), weight)
     assert value == pytest.approx(exact, abs=2e-6)
     assert (gradient - truth).norm() <= 1e-5 * truth.norm() + 1e-9
+
+
+@pytest.mark.parametrize("size", [(61, 45), (1, 1), (7, 100)])
+def test_the_fused_depth_variance_agrees_with_torch_in_float64(size):
+    x, y = pair(4, *size)
+    g = torch.Generator().manual_seed(3)
+    z = 1 + torch.rand(size, generator=g)
+    depths = (x[3] * z, x[3] * (z * z + 0.1 * torch.randn(size, generator=g)))
+
+    def all_of(dtype):
+        inputs = [t.to(dtype).requires_grad_() for t in (x.clone(), *depths)]
+        loss, error = picture_loss(inputs[0], Target.of(y.to(dtype)), 0.2, (inputs[1], inputs[2]), 3.0)
+        gradients = torch.autograd.grad(2 * loss, inputs)
+        return [loss.detach(), error, *gradients]
+
+    for found, exact in zip(all_of(torch.float32), all_of(torch.float64), strict=True):
+        torch.testing.assert_close(found, exact.float(), rtol=1e-4, atol=2e-6)
+
+
+def test_the_error_gives_the_psnr():
+    x, y = pair()
+    error = picture_loss(x, Target.of(y))[1]
+    assert -10 * math.log10(error.mean()) == pytest.approx(float(psnr(x, y)), rel=1e-5)
 
 
 def test_the_number_of_threads_does_not_matter():

@@ -7,8 +7,8 @@ from torch.autograd import gradcheck
 
 from hingesplat.gaussians import Gaussians
 from hingesplat.optim import GaussianAdam, LearningRates
-from hingesplat.poses import PoseDelta, StateLossConfig, draw_state, move, part_centres, state_loss
-from hingesplat.render import render
+from hingesplat.poses import PoseDelta, StateLossConfig, draw_state, part_centres, state_loss
+from hingesplat.render import move, render
 from hingesplat.se3 import apply, rotvec_to_matrix
 from hingesplat.training import training_view
 from scenes import (

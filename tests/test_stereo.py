@@ -159,7 +159,7 @@ def test_pictures_that_show_something_else_are_outvoted() -> None:
     depth = sweep(wall(facing(0)), [*noise, *others], PLANES, SMALL)
     assert share(np.abs(depth - DISTANCE) < 0.05) > 0.9
     all_must = sweep(wall(facing(0)), [*noise, *others], PLANES, replace(SMALL, best=4))
-    assert share(np.abs(all_must - DISTANCE) < 0.05) < share(np.abs(depth - DISTANCE) < 0.05)
+    assert share(np.abs(all_must - DISTANCE) < 0.02) < share(np.abs(depth - DISTANCE) < 0.02)
 
 
 def test_an_empty_picture_has_no_depth_and_a_masked_one_only_inside() -> None:

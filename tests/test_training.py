@@ -7,12 +7,10 @@ import torch
 from hingesplat.camera import Camera
 from hingesplat.capture import View
 from hingesplat.gaussians import Gaussians, concatenate
+from hingesplat.losses.photometric import depth_variance
 from hingesplat.optim import GaussianAdam, LearningRates
-from hingesplat.render import render
+from hingesplat.render import place, rasterize, render
 from hingesplat.training import (
-    depth_and_its_square,
-    depth_variance,
-    four_planes,
     grow,
     mean_psnr,
     seen_weight,
@@ -71,14 +69,9 @@ def test_an_empty_mask_keeps_the_whole_white_picture() -> None:
 
 
 def drawn_variance(gaussians: Gaussians) -> torch.Tensor:
-    channels = depth_and_its_square(gaussians.means, FRONT)
-    return depth_variance(render(gaussians, FRONT, channels=channels))
-
-
-def test_squared_depth_is_the_cameras_depth_squared() -> None:
-    points = torch.randn((9, 3), generator=torch.Generator().manual_seed(0))
-    expected = FRONT.project(points.double().numpy())[1] ** 2
-    np.testing.assert_allclose(depth_and_its_square(points, FRONT)[:, 0].numpy(), expected, rtol=1e-5)
+    placed = place(gaussians, FRONT)
+    r = rasterize(*placed.drawn, FRONT, channels=placed.squared_depth)
+    return depth_variance(r.alpha, r.depth, r.channels[0])
 
 
 def test_one_opaque_sheet_has_no_depth_variance_and_two_clear_ones_have_theirs() -> None:
@@ -155,7 +148,7 @@ def test_the_truth_draws_its_own_photographs() -> None:
     made = scene("static", 48)
     views = [training_view(v) for v in made.views[0][:4]]
     assert mean_psnr(made.gaussians, views) > 45
-    image = four_planes(render(made.gaussians, views[0].camera, background=torch.ones(3)))
+    image = render(made.gaussians, views[0].camera, background=torch.ones(3)).rgba
     assert float((image - views[0].image).abs().max()) < 0.02
     assert mean_psnr(made.gaussians[torch.arange(0, len(made.gaussians), 2)], views) < 40
 

@@ -18,7 +18,8 @@ from hingesplat.losses.repel import repel_force, sample_repel_points
 from hingesplat.losses.vector_field import vector_loss
 from hingesplat.losses.velocity import fit_parts, velocity_loss
 from hingesplat.optim import GaussianAdam, LearningRates
-from hingesplat.poses import PoseDelta, StateLossConfig, move, part_centres, state_loss
+from hingesplat.poses import PoseDelta, StateLossConfig, part_centres, state_loss
+from hingesplat.render import move
 from hingesplat.training import Report, averaged, grow, shuffled, training_view
 
 
@@ -26,7 +27,7 @@ from hingesplat.training import Report, averaged, grow, shuffled, training_view
 class ArticulateConfig:
     """Joint optimisation. Weights of the paper's terms are its λ; 0 leaves a term out."""
 
-    steps: int = 1500
+    steps: int = 1000
     """Optimiser steps, each on one photograph of one state."""
     max_gaussians: int = 16_000
     """Cap on the number of canonical Gaussians."""
@@ -61,7 +62,7 @@ class ArticulateConfig:
     """Push movable Gaussians off repel points on the base (eq. 14)."""
     repel_points: int = 2000
     """N_R."""
-    rates: LearningRates = field(default_factory=lambda: LearningRates(means=1e-3))
+    rates: LearningRates = field(default_factory=lambda: LearningRates(means=2e-3))
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ def articulate(
         if fitted and (not targets or step % 200 == 0) and (config.art_weight or config.vector_weight):
             targets = _match(optimiser.gaussians, poses, fitted, extent)
         means = _moved(optimiser.gaussians, R[state], t[state], p, repel_points, config)
-        loss, image = state_loss(
+        loss, error = state_loss(
             optimiser, R[state], t[state], view, state, config.render, extent, means=means, statistics=statistics
         )
         loss = loss + identity.loss(optimiser, p, step)
@@ -145,7 +146,7 @@ def articulate(
             statistics = torch.zeros((len(optimiser), 3))
             identity.stale()
             targets = []  # Rows have changed places.
-        tell(loss, image, view, len(optimiser))
+        tell(loss, error, len(optimiser))
     return _result(optimiser, poses)
 
 

@@ -274,7 +274,7 @@ def demo_config() -> "ReconstructConfig":
     config = ReconstructConfig()
     return replace(
         config,
-        fit=replace(config.fit, steps=1200, start_gaussians=3000, max_gaussians=8000),
+        fit=replace(config.fit, steps=1000, start_gaussians=3000, max_gaussians=8000),
         articulate=replace(config.articulate, steps=1500, max_gaussians=16_000),
         mesh=replace(config.mesh, views=32, image_size=200),
     )
@@ -379,8 +379,9 @@ class StageProgress:
                 self.tasks[label] = self.tasks.pop(stage)
                 self.progress.update(self.tasks[label], description=label)
             else:
-                for task in self.tasks.values():
-                    self._finish(task)
+                for name, task in self.tasks.items():
+                    if name.split()[0] != stage:  # States are fitted at once.
+                        self._finish(task)
                 self.tasks[label] = self.progress.add_task(label, total=None, numbers="")
         if "steps" in numbers:
             self.progress.update(

@@ -12,34 +12,33 @@ from torch import Tensor
 
 from hingesplat.capture import View, visual_hull
 from hingesplat.gaussians import SH_C0, Gaussians
-from hingesplat.losses.photometric import photometric
 from hingesplat.optim import GaussianAdam, LearningRates, morton_order
-from hingesplat.render import render
+from hingesplat.render import place
 from hingesplat.stereo import Cloud, DepthMap, fused, seen_through
 from hingesplat.surface import thin
 from hingesplat.training import (
     Report,
     TrainingView,
     averaged,
-    depth_and_its_square,
-    depth_variance,
-    four_planes,
     grow,
     mean_psnr,
     seen_weight,
     shuffled,
     training_view,
+    view_loss,
 )
 
 FLATNESS = 0.5
 """Thickness of a disc at the start, as a fraction of its width."""
+FREE = 0.2
+"""Fraction of the run in which nothing asks Gaussians to lie on surfaces."""
 
 
 @dataclass(frozen=True)
 class FitConfig:
     """One state's Gaussians."""
 
-    steps: int = 1500
+    steps: int = 1000
     """Optimiser steps."""
     start_gaussians: int = 4000
     """Gaussians at the start, on known depth and on the visual hull's shell."""
@@ -159,7 +158,6 @@ def _optimise(
     generator: torch.Generator,
     report: Report,
 ) -> None:
-    white = torch.ones(3)
     cameras = [v.camera for v in training]
     statistics = torch.zeros((len(optimiser), 3))
     photographs = shuffled([training], rng)
@@ -167,7 +165,7 @@ def _optimise(
     for step in range(config.steps):
         progress = step / config.steps
         _, view = next(photographs)
-        loss, image = _view_loss(optimiser, view, config, extent, progress, white, statistics)
+        loss, error = _view_loss(optimiser, view, config, extent, progress, statistics)
         loss.backward()
         optimiser.step(progress)
         growing = step >= 200 and progress < config.densify_until
@@ -177,7 +175,7 @@ def _optimise(
         if growing and step % 500 == 0:
             optimiser.select(seen_weight(optimiser.gaussians.detached(), cameras) > 0.5)
             statistics = torch.zeros((len(optimiser), 3))
-        tell(loss, image, view, len(optimiser))
+        tell(loss, error, len(optimiser))
 
 
 def _view_loss(
@@ -186,19 +184,11 @@ def _view_loss(
     config: FitConfig,
     extent: float,
     progress: float,
-    white: Tensor,
     statistics: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    g = optimiser.gaussians
-    regular = progress > 0.2 and config.depth_variance_weight > 0
-    channels = depth_and_its_square(g.means, view.camera) if regular else None
-    r = render(g, view.camera, background=white, channels=channels, screen_gradient=statistics)
-    image = four_planes(r)
-    loss = photometric(image, view.target, config.ssim_weight)
-    if regular:
-        loss = loss + config.depth_variance_weight * depth_variance(r) / extent**2
-        loss = loss + config.flatten_weight * g.scales.amin(1).mean() / extent
-    return loss, image
+    if progress <= FREE:
+        config = replace(config, depth_variance_weight=0, flatten_weight=0)
+    return view_loss(place(optimiser.gaussians, view.camera), view, config, extent, statistics=statistics)
 
 
 def _choose_sh_degree(
@@ -221,7 +211,7 @@ def _choose_sh_degree(
         photographs = shuffled([training], rng)
         for step in range(steps):
             _, view = next(photographs)
-            loss, _ = _view_loss(trial, view, config, extent, 0.6 + 0.4 * step / steps, torch.ones(3), None)
+            loss, _ = _view_loss(trial, view, config, extent, 0.6 + 0.4 * step / steps, None)
             loss.backward()
             trial.step(0.6 + 0.4 * step / steps)
         fitted = trial.gaussians.detached()

@@ -16,7 +16,7 @@ from hingesplat.optim import GaussianAdam, LearningRates
 from hingesplat.poses import StateLossConfig, draw_state, part_centres, state_loss
 from hingesplat.screw import matrix_to_screw
 from hingesplat.se3 import rotvec_to_matrix
-from hingesplat.training import Report, TrainingView, averaged, four_planes, shuffled, training_view
+from hingesplat.training import Report, TrainingView, averaged, shuffled, training_view
 from hingesplat.twin import Joint, JointStd, JointType
 
 log = logging.getLogger(__name__)
@@ -34,7 +34,7 @@ class JointsConfig:
     """It must also lower the error around the part by this fraction: more numbers always fit a little better."""
     hinge_reach: float = 1.0
     """A hinge line farther than this from its part, in extents, is a slide in disguise."""
-    steps: int = 400
+    steps: int = 500
     """Steps of the constrained refinement, everything together."""
     rate: float = 1e-3
     """Adam step of the joint parameters (radians, extents) at the start; decays to 2 %."""
@@ -42,7 +42,7 @@ class JointsConfig:
     """Photographs of each moved state from which standard deviations are made; 0 skips them."""
     render: StateLossConfig = field(default_factory=StateLossConfig)
     rates: LearningRates = field(
-        default_factory=lambda: LearningRates(means=3e-4, quats=1e-3, log_scales=2e-3, logit_opacities=1e-2, sh=3e-3)
+        default_factory=lambda: LearningRates(means=6e-4, quats=2e-3, log_scales=4e-3, logit_opacities=2e-2, sh=6e-3)
     )
 
 
@@ -161,11 +161,11 @@ def find_joints(
         progress = step / config.steps
         state, view = next(photographs)
         R, t = poses.Rt()
-        loss, image = state_loss(optimiser, R[state], t[state], view, state, config.render, extent)
+        loss, error = state_loss(optimiser, R[state], t[state], view, state, config.render, extent)
         loss.backward()
         optimiser.step(progress)
         _joint_step(adam, config.rate, progress)
-        tell(loss, image, view, len(optimiser))
+        tell(loss, error, len(optimiser))
     finished = optimiser.gaussians.detached()
     offsets = optimiser.values["state_sh"].detach().permute(1, 0, 2)
     all_sh = torch.cat([torch.zeros_like(offsets[:1]), offsets]).contiguous()
@@ -187,7 +187,7 @@ def _picture_loss(
 ) -> Tensor:
     R, t = poses.Rt()
     r = draw_state(g, R[state], t[state], view.camera, sh_offset=sh[state], background=torch.ones(3))
-    return photometric(four_planes(r), view.target, config.render.ssim_weight)
+    return photometric(r.rgba, view.target, config.render.ssim_weight)
 
 
 def _choose_types(
@@ -222,9 +222,11 @@ def _choose_types(
     for j in range(n_joints):
         difference = losses["prismatic"][:, j] - losses["revolute"][:, j]
         difference = difference[np.isfinite(difference)]
-        error = difference.std() / math.sqrt(max(len(difference), 1)) + 1e-12
-        z = float(difference.mean() / error) if len(difference) else 0.0
-        gain = float(difference.mean() / np.nanmean(losses["prismatic"][:, j])) if len(difference) else 0.0
+        z = gain = 0.0
+        if len(difference):  # Photographs that show the part with both.
+            error = difference.std() / math.sqrt(len(difference)) + 1e-12
+            z = float(difference.mean() / error)
+            gain = float(difference.mean() / np.nanmean(losses["prismatic"][:, j]))
         hinged = z > config.type_significance and gain > config.type_gain and float(reach[j]) < config.hinge_reach
         log.debug("joint %d: z %.1f, gain %.3f, reach %.2f", j + 1, z, gain, float(reach[j]))
         kinds.append("revolute" if hinged else "prismatic")
@@ -245,8 +247,9 @@ def _losses_by_part(
     for s in range(1, len(training)):
         for view in training[s]:
             r = draw_state(g, R[s], t[s], view.camera, sh_offset=sh[s], background=torch.ones(3), channels=membership)
-            error = (four_planes(r) - view.image).abs().mean(0)
-            region = torch.nn.functional.max_pool2d(r.channels[None], 15, 1, 7)[0] > 0.3
+            error = (r.rgba - view.image).abs().mean(0)
+            tall = torch.nn.functional.max_pool2d(r.channels[None], (15, 1), 1, (7, 0))
+            region = torch.nn.functional.max_pool2d(tall, (1, 15), 1, (0, 7))[0] > 0.3
             area = region.flatten(1).sum(1)
             mean = (error * region).flatten(1).sum(1) / area.clamp_min(1)
             rows.append(torch.where(area > 30, mean, torch.nan).numpy())

@@ -4,11 +4,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numba import njit
 from torch import Tensor
 
 from hingesplat.gaussians import Gaussians
 from hingesplat.se3 import wxyz_to_matrix
+from hingesplat.simd import parallel
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh")
 
@@ -17,16 +20,62 @@ PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh")
 class LearningRates:
     """Adam step sizes at the start; means are in units of the object's extent."""
 
-    means: float = 2e-3
+    means: float = 4e-3
     """Centres, times the extent; decays to 1 % over the run."""
-    quats: float = 5e-3
+    quats: float = 1e-2
     """Orientations; this and the rest decay to 10 %."""
-    log_scales: float = 1e-2
+    log_scales: float = 2e-2
     """Log standard deviations."""
     logit_opacities: float = 5e-2
     """Opacity logits."""
-    sh: float = 1e-2
+    sh: float = 2e-2
     """Spherical-harmonic coefficients (constant term; the others get a tenth)."""
+
+
+BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
+NUMBERS_PER_THREAD = 32_768
+"""With fewer, another thread costs more than it brings."""
+
+
+@dataclass
+class Moments:
+    """What Adam (Kingma and Ba 2015) knows of one tensor."""
+
+    first: Tensor
+    second: Tensor
+    steps: int = 0
+
+    def step(self, value: Tensor, rate: float) -> None:
+        """Move ``value`` against its gradient, and clear that; without a gradient nothing happens."""
+        gradient = value.grad
+        if gradient is None:
+            return
+        self.steps += 1
+        rate = rate / (1 - BETA1**self.steps)
+        shrink = 1 / math.sqrt(1 - BETA2**self.steps)
+        tensors = (value.detach(), gradient.contiguous(), self.first, self.second)
+        if value.is_cuda or any(t.dtype != torch.float32 for t in tensors):
+            self.first.lerp_(gradient, 1 - BETA1)
+            self.second.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
+            value.detach().addcdiv_(self.first, (self.second.sqrt() * shrink).add_(EPSILON), value=-rate)
+        else:
+            threads = min(torch.get_num_threads(), 1 + value.numel() // NUMBERS_PER_THREAD)
+            parallel(_adam, threads, *(t.view(-1).numpy() for t in tensors), np.float32(rate), np.float32(shrink))
+        value.grad = None
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _adam(value, gradient, first, second, rate, shrink, t, threads):
+    """See ``Moments.step``; flat arrays."""
+    mine = slice(t * len(value) // threads, (t + 1) * len(value) // threads)
+    value, gradient, first, second = value[mine], gradient[mine], first[mine], second[mine]
+    beta1, beta2, epsilon, one = np.float32(BETA1), np.float32(BETA2), np.float32(EPSILON), np.float32(1)
+    for i in range(len(value)):
+        g = gradient[i]
+        m = beta1 * first[i] + (one - beta1) * g
+        v = beta2 * second[i] + (one - beta2) * g * g
+        first[i], second[i] = m, v
+        value[i] -= rate * m / (np.sqrt(v) * shrink + epsilon)
 
 
 class GaussianAdam:
@@ -50,12 +99,10 @@ class GaussianAdam:
         values |= {name: value for name, (value, _) in (extra or {}).items()}
         self._set({name: v.detach().clone() for name, v in values.items()}, {})
 
-    def _set(self, values: Mapping[str, Tensor], moments: Mapping[str, tuple[Tensor, Tensor, Tensor]]) -> None:
+    def _set(self, values: Mapping[str, Tensor], moments: Mapping[str, Moments]) -> None:
         self.values = {name: v.contiguous().requires_grad_() for name, v in values.items()}
-        groups = [{"params": [v], "name": name, "lr": 0.0} for name, v in self.values.items()]
-        self.adam = torch.optim.Adam(groups, eps=1e-15, fused=True)
-        for name, (step, first, second) in moments.items():
-            self.adam.state[self.values[name]] = {"step": step, "exp_avg": first, "exp_avg_sq": second}
+        fresh = {name: Moments(torch.zeros_like(v), torch.zeros_like(v)) for name, v in values.items()}
+        self.moments = fresh | dict(moments)
 
     def __len__(self) -> int:
         return self.values["means"].shape[0]
@@ -67,34 +114,28 @@ class GaussianAdam:
 
     def step(self, progress: float) -> None:
         """One update; ``progress`` in [0, 1] sets the decay. Gradients are cleared."""
-        for group in self.adam.param_groups:
-            name = group["name"]
-            base = self.extra_rates[name] if name in self.extra_rates else getattr(self.rates, name)
-            floor = 0.01 if name == "means" else 0.1
-            group["lr"] = base * (self.extent if name == "means" else 1.0) * floor**progress
         lobes = self.values["sh"].detach()[:, 1:]
         before = lobes.clone()
-        self.adam.step()
-        # Adam is blind to gradient scale: the lobes' slower pace is a fraction of its step.
-        lobes.lerp_(before, 0.9)
-        self.adam.zero_grad(set_to_none=True)
-
-    def _moments(self) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
-        states = {name: self.adam.state.get(v) for name, v in self.values.items()}
-        return {n: (s["step"], s["exp_avg"], s["exp_avg_sq"]) for n, s in states.items() if s}
+        for name, value in self.values.items():
+            base = self.extra_rates[name] if name in self.extra_rates else getattr(self.rates, name)
+            floor = 0.01 if name == "means" else 0.1
+            rate = base * (self.extent if name == "means" else 1.0) * floor**progress
+            self.moments[name].step(value, rate)
+        if lobes.shape[1]:  # Adam is blind to gradient scale: the lobes' slower pace is a fraction of its step.
+            lobes.lerp_(before, 0.9)
 
     def select(self, index: Tensor) -> None:
         """Keep only the rows of ``index`` (mask or indices), in that order."""
-        moments = {n: (step, m[index], v[index]) for n, (step, m, v) in self._moments().items()}
+        moments = {n: Moments(m.first[index], m.second[index], m.steps) for n, m in self.moments.items()}
         self.part = self.part[index]
         self._set({n: v.detach()[index] for n, v in self.values.items()}, moments)
 
     def duplicate(self, rows: Tensor) -> None:
         """Append copies of ``rows`` (indices) with fresh moments."""
         moments = {}
-        for name, (step, m, v) in self._moments().items():
-            zeros = torch.zeros_like(m[rows])
-            moments[name] = (step, torch.cat([m, zeros]), torch.cat([v, zeros]))
+        for name, m in self.moments.items():
+            zeros = torch.zeros_like(m.first[rows])
+            moments[name] = Moments(torch.cat([m.first, zeros]), torch.cat([m.second, zeros]), m.steps)
         self.part = torch.cat([self.part, self.part[rows]])
         self._set({n: torch.cat([v.detach(), v.detach()[rows]]) for n, v in self.values.items()}, moments)
 

@@ -12,12 +12,14 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from hashlib import blake2b
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from threading import Event
 from typing import Any, Literal
 
 import numpy as np
@@ -240,12 +242,33 @@ def _stereo(run: Run) -> None:
 
 
 def _fit(run: Run) -> None:
-    for t, state in enumerate(run.capture.states):
-        path = run / f"fit_state{t}.safetensors"
-        if not path.is_file():
-            config, seed = run.config.fit, run.config.seed
-            report = run.reporting("fit", state=t)
-            fit(state.train, config, seed=seed, maps=_depth(run, t), report=report).save(path)
+    """The states know nothing of each other: cores are better used by several fits than by several threads a fit."""
+    paths = {t: run / f"fit_state{t}.safetensors" for t in range(len(run.views))}
+    left = [t for t, path in paths.items() if not path.is_file()]
+    threads, stopped = torch.get_num_threads(), Event()
+    at_once = max(1, min(threads, len(left)))
+
+    def fit_state(t: int) -> None:
+        torch.set_num_threads(threads // at_once)  # Of this Python thread only.
+
+        def report(**numbers: Any) -> None:
+            if stopped.is_set():
+                raise InterruptedError("another state's fit has failed")
+            run.report(stage="fit", state=t, **numbers)
+
+        config, seed = run.config.fit, run.config.seed
+        fit(run.views[t], config, seed=seed, maps=_depth(run, t), report=report).save(paths[t])
+
+    with ThreadPoolExecutor(at_once) as pool:
+        fits = [pool.submit(fit_state, t) for t in left]
+        try:
+            for done in as_completed(fits):
+                done.result()
+        except BaseException:  # Ctrl-C too: who is still at work stops at the next report.
+            stopped.set()
+            pool.shutdown(cancel_futures=True)
+            raise
+    torch.set_num_threads(threads)  # Threads to come follow whoever said so last.
 
 
 def _segment(run: Run) -> None:

@@ -7,11 +7,10 @@ from torch import Tensor
 
 from hingesplat.camera import Camera
 from hingesplat.gaussians import Gaussians
-from hingesplat.losses.photometric import photometric
 from hingesplat.optim import GaussianAdam
-from hingesplat.render import Rendering, rasterize, sh_to_rgb
-from hingesplat.se3 import matrix_to_wxyz, quat_multiply, rotvec_to_matrix
-from hingesplat.training import TrainingView, depth_and_its_square, depth_variance, four_planes
+from hingesplat.render import Rendering, place, rasterize
+from hingesplat.se3 import rotvec_to_matrix
+from hingesplat.training import TrainingView, view_loss
 
 
 class PoseDelta:
@@ -61,30 +60,8 @@ def draw_state(
         sh_offset: (n, 3) added to the constant colour coefficient: this state's light.
         means: (n, 3) centres to use instead of the hard motion (soft assignment, repulsion).
     """
-    if means is None:
-        means = move(g.means, g.part, R, t)
-    quats = quat_multiply(matrix_to_wxyz(R)[g.part], g.quats)
-    sh = g.sh
-    if sh_offset is not None:
-        sh = torch.cat([sh[:, :1] + sh_offset[:, None], sh[:, 1:]], 1)
-    centre = torch.as_tensor(camera.centre, dtype=means.dtype)
-    directions = torch.nn.functional.normalize(means - centre, dim=1)
-    return rasterize(
-        means,
-        quats,
-        g.scales,
-        g.opacities,
-        sh_to_rgb(sh, directions),
-        camera,
-        channels=channels,
-        background=background,
-        screen_gradient=screen_gradient,
-    )
-
-
-def move(means: Tensor, part: Tensor, R: Tensor, t: Tensor) -> Tensor:
-    """Centres (n, 3) under their own part's pose."""
-    return (R[part] @ means[..., None])[..., 0] + t[part]
+    placed = place(g, camera, pose=(R, t), means=means, sh_offset=sh_offset)
+    return rasterize(*placed.drawn, camera, channels=channels, background=background, screen_gradient=screen_gradient)
 
 
 def part_centres(g: Gaussians, parts: int) -> Tensor:
@@ -119,7 +96,7 @@ def state_loss(
     means: Tensor | None = None,
     statistics: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """L_render and its regularisers for one photograph, and the (4, h, w) picture it judges.
+    """L_render and its regularisers for one photograph, and (4,) mean squared error of r, g, b and alpha.
 
     Args:
         optimiser: holds the Gaussians, and ``state_sh`` (n, states − 1, 3).
@@ -127,22 +104,8 @@ def state_loss(
     """
     g = optimiser.gaussians
     offset = optimiser.values["state_sh"][:, state - 1] if state else None
-    at = means if means is not None else move(g.means, g.part, R, t)
-    r = draw_state(
-        g,
-        R,
-        t,
-        view.camera,
-        sh_offset=offset,
-        means=at,
-        background=torch.ones(3),
-        channels=depth_and_its_square(at, view.camera),
-        screen_gradient=statistics,
-    )
-    image = four_planes(r)
-    loss = photometric(image, view.target, config.ssim_weight)
-    loss = loss + config.depth_variance_weight * depth_variance(r) / extent**2
-    loss = loss + config.flatten_weight * g.scales.amin(1).mean() / extent
+    placed = place(g, view.camera, pose=(R, t), means=means, sh_offset=offset)
+    loss, error = view_loss(placed, view, config, extent, statistics=statistics)
     if offset is not None:
         loss = loss + config.state_colour_weight * offset.abs().mean()
-    return loss, image
+    return loss, error

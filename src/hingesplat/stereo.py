@@ -4,6 +4,7 @@ A visual hull has a lid on every hollow. Gaussians that start on the lid are pai
 never get there; photographs compared with their neighbours know the depth of most of it beforehand.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -161,21 +162,33 @@ def normals_by_neighbours(points: np.ndarray, k: int = 12) -> np.ndarray:
 
 def seen_through(points: np.ndarray, maps: Sequence[DepthMap], tolerance: float) -> np.ndarray:
     """(n,) number of depth maps that put their surface more than ``tolerance`` behind points (n, 3)."""
-    count = np.zeros(len(points), int)
+    return _votes(points, maps, tolerance / 2)[1]
+
+
+def _votes(points: np.ndarray, maps: Sequence[DepthMap], tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """How many maps put their surface within ``tolerance`` of each point (n, 3), and how many twice as far behind."""
+    same, through = np.zeros(len(points), int), np.zeros(len(points), int)
     for m in maps:
-        at, behind = _beyond(points, m)
-        count[at] += behind > tolerance
-    return count
+        P = m.camera.K @ m.camera.T_camera_world[:3]
+        parallel(_vote, torch.get_num_threads(), points, P, m.depth, tolerance, same, through)
+    return same, through
 
 
-def _beyond(points: np.ndarray, m: DepthMap) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the points that a depth map knows something of, and how far its surface is behind each."""
-    uv, d = m.camera.project(points)
-    u, v = np.floor(uv).astype(int).T
-    at = np.flatnonzero((d > 0) & (u >= 0) & (v >= 0) & (u < m.camera.width) & (v < m.camera.height))
-    surface = m.depth[v[at], u[at]]
-    known = surface > 0
-    return at[known], surface[known] - d[at[known]]
+@njit(cache=True, nogil=True, error_model="numpy")
+def _vote(points, P, depth, tolerance, same, through, thread, threads):  # pragma: no cover - compiled
+    """One map's votes added to ``same`` and ``through``; P (3, 4) takes points to pixels times depth, and depth."""
+    height, width = depth.shape
+    for i in range(thread * len(points) // threads, (thread + 1) * len(points) // threads):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        d = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z + P[2, 3]
+        if d <= 0:
+            continue
+        u = math.floor((P[0, 0] * x + P[0, 1] * y + P[0, 2] * z + P[0, 3]) / d)
+        v = math.floor((P[1, 0] * x + P[1, 1] * y + P[1, 2] * z + P[1, 3]) / d)
+        if 0 <= u < width and 0 <= v < height and depth[v, u] > 0:
+            behind = depth[v, u] - d
+            same[i] += abs(behind) < tolerance
+            through[i] += behind > 2 * tolerance
 
 
 def _picture(view: View, size: int) -> Picture:
@@ -213,7 +226,8 @@ def _pixel_to_pixel(source: Camera, target: Camera) -> tuple[np.ndarray, np.ndar
     """A (3, 3) and b (3,): the source pixel (u, v) at depth z is at ``z A (u, v, 1) + b`` in target's image, times
     its depth there."""
     T = target.T_camera_world @ source.T_world_camera
-    return target.K @ T[:3, :3] @ np.linalg.inv(source.K), target.K @ T[:3, 3]
+    A, b = target.K @ T[:3, :3] @ np.linalg.inv(source.K), target.K @ T[:3, 3]
+    return A.astype(np.float32), b.astype(np.float32)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
@@ -221,26 +235,26 @@ def _match(reference, other, A, b, planes, radius, cost, thread, threads):  # pr
     """Mean truncated colour difference of the patches around each pixel, for each depth: (planes, h, w)."""
     h, w = cost.shape[1:]
     height, width = other.shape[:2]
+    one, half, slack = np.float32(1), np.float32(0.5), np.float32(1e-3)
     raw = np.empty((h, w), np.float32)
     summed = np.empty((h + 1, w + 1), np.float32)
     for p in range(thread, len(planes), threads):
-        z = planes[p]
+        z = np.float32(planes[p])
         for y in range(h):
             for x in range(w):
                 raw[y, x] = TRUNCATE
                 if reference[y, x, 3] <= 0.1:
                     continue
-                u, v = x + 0.5, y + 0.5
+                u, v = np.float32(x + 0.5), np.float32(y + 0.5)
                 d = z * (A[2, 0] * u + A[2, 1] * v + A[2, 2]) + b[2]
                 if d < 1e-6:
                     continue
-                s = (z * (A[0, 0] * u + A[0, 1] * v + A[0, 2]) + b[0]) / d - 0.5
-                t = (z * (A[1, 0] * u + A[1, 1] * v + A[1, 2]) + b[1]) / d - 0.5
-                if s < 0 or t < 0 or s >= width - 1 or t >= height - 1:
+                s = (z * (A[0, 0] * u + A[0, 1] * v + A[0, 2]) + b[0]) / d - half
+                t = (z * (A[1, 0] * u + A[1, 1] * v + A[1, 2]) + b[1]) / d - half
+                if s < -slack or t < -slack or s >= width - 1 or t >= height - 1:
                     continue
                 i, j = int(s), int(t)
-                f, g = np.float32(s - i), np.float32(t - j)
-                one = np.float32(1)
+                f, g = s - np.float32(i), t - np.float32(j)
                 w00, w01, w10, w11 = (one - f) * (one - g), f * (one - g), (one - f) * g, f * g
                 difference = np.float32(0)
                 for c in range(3):
@@ -253,7 +267,7 @@ def _match(reference, other, A, b, planes, radius, cost, thread, threads):  # pr
                     difference += abs(e - reference[y, x, c])
                 solid = max(other[j, i, 3], other[j, i + 1, 3], other[j + 1, i, 3], other[j + 1, i + 1, 3])
                 if solid > 0.1:
-                    raw[y, x] = min(difference / 3, TRUNCATE)
+                    raw[y, x] = min(difference / np.float32(3), np.float32(TRUNCATE))
         summed[0, :] = 0
         for y in range(h):
             row = np.float32(0)
@@ -273,24 +287,25 @@ def _match(reference, other, A, b, planes, radius, cost, thread, threads):  # pr
 def _winner(cost, inverse_planes, best, depth, thread, threads):  # pragma: no cover - compiled
     """The depth at which the ``best`` most alike pictures differ least, between the planes by a parabola."""
     n, planes, h, w = cost.shape
-    curve = np.empty(planes, np.float32)
-    least = np.empty(best, np.float32)
+    curve, least, carried = np.empty((planes, w), np.float32), np.empty((best, w), np.float32), np.empty(w, np.float32)
     for y in range(thread, h, threads):
+        for p in range(planes):
+            least[:] = np.inf
+            for k in range(n):
+                carried[:] = cost[k, p, y]
+                for m in range(best):  # Insertion, for a whole row of pixels at a time.
+                    for x in range(w):
+                        low, high = min(carried[x], least[m, x]), max(carried[x], least[m, x])
+                        least[m, x], carried[x] = low, high
+            for x in range(w):
+                curve[p, x] = least[:, x].sum()
         for x in range(w):
-            for p in range(planes):
-                least[:] = np.inf
-                for k in range(n):
-                    e = cost[k, p, y, x]
-                    for m in range(best):
-                        if e < least[m]:
-                            e, least[m] = least[m], e
-                curve[p] = least.sum()
-            p = curve.argmin()
+            p = curve[:, x].argmin()
             offset = np.float32(0)
             if 0 < p < planes - 1:
-                bend = curve[p - 1] - 2 * curve[p] + curve[p + 1]
+                bend = curve[p - 1, x] - 2 * curve[p, x] + curve[p + 1, x]
                 if bend > 1e-9:
-                    offset = 0.5 * (curve[p - 1] - curve[p + 1]) / bend
+                    offset = 0.5 * (curve[p - 1, x] - curve[p + 1, x]) / bend
             depth[y, x] = 1 / (inverse_planes[p] + offset * (inverse_planes[1] - inverse_planes[0]))
 
 
@@ -299,12 +314,7 @@ def confirmed(index: int, maps: Sequence[DepthMap], tolerance: float, agree: int
     m = maps[index]
     y, x = np.nonzero(m.depth > 0)
     points = m.camera.lifted(x, y, m.depth[y, x])
-    same, through = np.zeros(len(points), int), np.zeros(len(points), int)
-    for k, other in enumerate(maps):
-        if k != index:
-            at, behind = _beyond(points, other)
-            same[at] += np.abs(behind) < tolerance
-            through[at] += behind > 2 * tolerance
+    same, through = _votes(points, [*maps[:index], *maps[index + 1 :]], tolerance)
     keep = (same >= agree) & (same >= 0.5 * through)
     depth = np.zeros_like(m.depth)
     depth[y[keep], x[keep]] = m.depth[y[keep], x[keep]]

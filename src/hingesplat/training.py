@@ -1,8 +1,10 @@
 """What every optimisation loop shares: prepared photographs, depth regularisers, growing and pruning the set."""
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from statistics import fmean
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -11,9 +13,9 @@ from torch import Tensor
 from hingesplat.camera import Camera
 from hingesplat.capture import View
 from hingesplat.gaussians import Gaussians
-from hingesplat.losses.photometric import Target, psnr
+from hingesplat.losses.photometric import Target, picture_loss, psnr
 from hingesplat.optim import GaussianAdam, densify, morton_order
-from hingesplat.render import Rendering, render
+from hingesplat.render import Placed, rasterize, render
 
 Report = Callable[..., None]
 """Called now and then with ``step, steps, loss, psnr, gaussians``."""
@@ -47,17 +49,18 @@ def training_view(view: View, margin: int = 8) -> TrainingView:
     return TrainingView(camera, Target.of(image), image)
 
 
-def averaged(report: Report, steps: int) -> Callable[[Tensor, Tensor, TrainingView, int], None]:
-    """Tell it ``loss, image, view, gaussians`` after each step; it reports after the first and every so many.
+def averaged(report: Report, steps: int) -> Callable[[Tensor, Tensor, int], None]:
+    """Tell it ``loss, error, gaussians`` after each step; it reports after the first and every so many.
 
     Loss and PSNR are means over the steps since the last report: each saw one photograph, and some are harder.
+    ``error`` are mean squared errors of r, g, b and more.
     """
     step, losses, scores = 0, [], []
 
-    def after_step(loss: Tensor, image: Tensor, view: TrainingView, gaussians: int) -> None:
+    def after_step(loss: Tensor, error: Tensor, gaussians: int) -> None:
         nonlocal step
         losses.append(float(loss.detach()))
-        scores.append(float(psnr(image.detach()[:3], view.image[:3])))
+        scores.append(-10 * math.log10(max(fmean(error[:3].tolist()), 1e-12)))
         step += 1
         if (step - 1) % REPORT_EVERY == 0 or step == steps:
             report(step=step, steps=steps, loss=fmean(losses), psnr=fmean(scores), gaussians=gaussians)
@@ -67,23 +70,36 @@ def averaged(report: Report, steps: int) -> Callable[[Tensor, Tensor, TrainingVi
     return after_step
 
 
-def four_planes(rendering: Rendering) -> Tensor:
-    """Rgb and alpha of a rendering as (4, h, w), to compare with ``TrainingView.image``."""
-    return torch.cat([rendering.rgb, rendering.alpha[None]])
+class Surfaces(Protocol):
+    """What pictures cost, and what keeps Gaussians on surfaces."""
+
+    @property
+    def ssim_weight(self) -> float: ...
+    @property
+    def depth_variance_weight(self) -> float: ...
+    @property
+    def flatten_weight(self) -> float: ...
 
 
-def depth_and_its_square(means: Tensor, camera: Camera) -> Tensor:
-    """(n, 1) squared depth of each centre: the extra channel from which ``depth_variance`` is made."""
-    row = torch.as_tensor(camera.T_camera_world[2], dtype=means.dtype)
-    return (means @ row[:3] + row[3]).square()[:, None]
+def view_loss(
+    placed: Placed, view: TrainingView, config: Surfaces, extent: float, *, statistics: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """What one photograph asks of Gaussians before its camera: that they look like it and lie on surfaces.
 
-
-def depth_variance(rendering: Rendering) -> Tensor:
-    """Mean over covered pixels of the variance of depth along the ray, scene units squared."""
-    alpha = rendering.alpha.clamp_min(1e-3)
-    mean = rendering.depth / alpha
-    variance = (rendering.channels[0] / alpha - mean.square()).clamp_min(0)
-    return (variance * (rendering.alpha > 0.5)).mean()
+    Returns:
+        The loss, and (4,) mean squared error of r, g, b and alpha.
+    """
+    options = {"background": torch.ones(3), "screen_gradient": statistics}
+    weight = config.depth_variance_weight / extent**2
+    if weight == 0:
+        rgba, depths = rasterize(*placed.drawn, view.camera, **options).rgba, None
+    else:
+        r = rasterize(*placed.drawn, view.camera, channels=placed.squared_depth, **options)
+        rgba, depths = r.rgba, (r.depth, r.channels[0])
+    loss, error = picture_loss(rgba, view.target, config.ssim_weight, depths, weight)
+    if config.flatten_weight:
+        loss = loss + config.flatten_weight / extent * placed.scales.amin(1).mean()
+    return loss, error
 
 
 def shuffled(states: Sequence[Sequence[TrainingView]], rng: np.random.Generator) -> Iterator[tuple[int, TrainingView]]:

@@ -87,8 +87,8 @@ def collision_hulls(mesh: trimesh.Trimesh, cache: Path, *, most: int = 12) -> tu
             preprocess_mode="off",
             resolution=500,
             mcts_nodes=8,
-            mcts_iterations=20,
-            mcts_max_depth=2,
+            mcts_iterations=10,
+            mcts_max_depth=1,
             seed=0,
         )
         hulls = [trimesh.convex.convex_hull(points) for points, _ in pieces]

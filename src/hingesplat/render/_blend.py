@@ -119,7 +119,7 @@ def _blend_tile(build, x0, y0, x1, y1, record, stride, items, shapes, start, sto
 
 @njit(**INNER)
 def _write_tile(x0, y0, x1, y1, width, height, buffer, background, image):
-    """Features over the background, and alpha, to the image planes (features …, alpha)."""
+    """Features over the background, and alpha, to the image planes (colours, alpha, other features)."""
     area, features = width * height, background.shape[0]
     for r in range(y1 - y0 + 1):
         b, p, c = r * PITCH, (y0 + r) * width + x0, 0
@@ -127,18 +127,18 @@ def _write_tile(x0, y0, x1, y1, width, height, buffer, background, image):
             t = vload(buffer, b + c)
             for k in range(features):
                 value = vfma(t, sload(background, k), vload(buffer, (k + 1) * PLANE + b + c))
-                vstore(image, k * area + p + c, value)
-            vstore(image, features * area + p + c, _1 - t)
+                vstore(image, (k + (k >= 3)) * area + p + c, value)
+            vstore(image, 3 * area + p + c, _1 - t)
             c += LANES
         while c < x1 - x0 + 1:
             t1 = sload(buffer, b + c)
             for k in range(features):
                 sstore(
                     image,
-                    k * area + p + c,
+                    (k + (k >= 3)) * area + p + c,
                     t1 * sload(background, k) + sload(buffer, (k + 1) * PLANE + b + c),
                 )
-            sstore(image, features * area + p + c, _1 - t1)
+            sstore(image, 3 * area + p + c, _1 - t1)
             c += 1
 
 
@@ -213,7 +213,7 @@ def _load_tile(build, x0, y0, x1, y1, width, height, image, g_image, buffer):
     The *rest* is Σ gradient·image over all planes: what the Gaussians not yet passed, and the background,
     still add to the linearised loss.
     """
-    g_colors, g_channels, g_depth, g_alpha = g_image
+    g_rgba, g_channels, g_depth = g_image
     area, zero = width * height, vsplat(_0)
     count = g_channels.shape[0] // area
     for q in range(0, (planes_of(build) + 3) * PLANE, LANES):
@@ -222,11 +222,11 @@ def _load_tile(build, x0, y0, x1, y1, width, height, image, g_image, buffer):
         for c in range(x1 - x0 + 1):
             sstore(buffer, r * PITCH + c, _1)
     for k in range(3):
-        _load_plane(3 + k, x0, y0, x1, y1, width, image, k * area, g_colors, k * area, buffer)
+        _load_plane(3 + k, x0, y0, x1, y1, width, image, k * area, g_rgba, k * area, buffer)
     for k in range(count):
-        _load_plane(6 + k, x0, y0, x1, y1, width, image, (3 + k) * area, g_channels, k * area, buffer)
-    _load_plane(6 + count, x0, y0, x1, y1, width, image, (3 + count) * area, g_depth, 0, buffer)
-    _load_plane(2, x0, y0, x1, y1, width, image, (4 + count) * area, g_alpha, 0, buffer)
+        _load_plane(6 + k, x0, y0, x1, y1, width, image, (4 + k) * area, g_channels, k * area, buffer)
+    _load_plane(6 + count, x0, y0, x1, y1, width, image, (4 + count) * area, g_depth, 0, buffer)
+    _load_plane(2, x0, y0, x1, y1, width, image, 3 * area, g_rgba, 3 * area, buffer)
 
 
 @njit(**INNER)

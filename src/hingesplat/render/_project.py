@@ -396,3 +396,15 @@ def unproject(build, means, quats, scales, opacities, view, partial, stride, off
         for g in range(i, i + LANES):
             if sload(offsets, g) == sload(offsets, g + 1):
                 _clear(g, count, grads)
+
+
+@njit(**KERNEL)
+def record_screen_gradient(build, gradient, segments, record, stride, statistics):
+    """``torch_backend.record_screen_gradient`` with the pixel-space ``gradient`` (n, 2) of everyone seen."""
+    for i in range(len(gradient)):
+        if segments[i] > 0:
+            dx, dy = gradient[i, 0], gradient[i, 1]
+            statistics[i, 0] += math.sqrt(dx * dx + dy * dy)
+            statistics[i, 1] += _1
+            radius = max(record[i * stride + REC_EXTENT_X], record[i * stride + REC_EXTENT_Y])
+            statistics[i, 2] = max(statistics[i, 2], radius)

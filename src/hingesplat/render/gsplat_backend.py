@@ -19,8 +19,8 @@ def rasterize(
     background: Tensor,
     early_stop: bool,
     screen_gradient: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """See ``hingesplat.render.rasterize``: rgb (3, H, W), depth (H, W), alpha (H, W), channels (C, H, W).
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See ``hingesplat.render.rasterize``: rgba (4, H, W), depth (H, W), channels (C, H, W).
 
     gsplat always stops early, whatever ``early_stop`` says, and rounds radii up to whole pixels.
 
@@ -38,7 +38,7 @@ def rasterize(
 
     if len(means) == 0:  # gsplat wants at least one
         blank = means.sum() + means.new_zeros((channels.shape[1] + 5, camera.height, camera.width))
-        return blank[:3] + background[:, None, None], blank[3], blank[4], blank[5:]
+        return torch.cat([blank[:3] + background[:, None, None], blank[3:4]]), blank[4], blank[5:]
     intrinsics = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
     image, alpha, meta = rasterization(
         means,
@@ -62,4 +62,4 @@ def rasterize(
         meta["means2d"].register_hook(lambda g: record_screen_gradient(screen_gradient, seen, g[0, seen], radius))
     alpha = alpha[0, :, :, 0]
     rgb, others, depth = image[0].permute(2, 0, 1).split([3, channels.shape[1], 1])
-    return rgb + (1 - alpha) * background[:, None, None], depth[0], alpha, others
+    return torch.cat([rgb + (1 - alpha) * background[:, None, None], alpha[None]]), depth[0], others

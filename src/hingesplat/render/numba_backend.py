@@ -15,14 +15,9 @@ from torch import Tensor
 from hingesplat.camera import Camera
 from hingesplat.errors import HingesplatError
 from hingesplat.render._blend import blend, unblend
-from hingesplat.render._project import SUM_FEATURES, View, project, unproject
-from hingesplat.render._tiles import REC_EXTENT_X, REC_FEATURES, TILE, fill_lists, sort_and_offset
-from hingesplat.render.torch_backend import (
-    NEAR,
-    TRANSMITTANCE_MIN,
-    record_screen_gradient,
-    tangent_limits,
-)
+from hingesplat.render._project import SUM_FEATURES, View, project, record_screen_gradient, unproject
+from hingesplat.render._tiles import REC_FEATURES, TILE, fill_lists, sort_and_offset
+from hingesplat.render.torch_backend import NEAR, TRANSMITTANCE_MIN, tangent_limits
 from hingesplat.simd import LANES, Build, parallel
 
 CHANNEL_SIZES = (0, 1, 4, 8, 16)
@@ -45,8 +40,8 @@ def rasterize(
     background: Tensor,
     early_stop: bool,
     screen_gradient: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """See ``hingesplat.render.rasterize``: rgb (3, H, W), depth (H, W), alpha (H, W), channels (C, H, W).
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See ``hingesplat.render.rasterize``: rgba (4, H, W), depth (H, W), channels (C, H, W).
 
     Raises:
         HingesplatError: a tensor is not float32 on the CPU.
@@ -61,20 +56,28 @@ def rasterize(
     shift = torch.zeros((len(colors), 2), requires_grad=screen_gradient is not None)
 
     most = CHANNEL_SIZES[-1]
-    rgb, first, depth, alpha = _Draw.apply(*geometry, colors, channels[:, :most], shift, camera, background, early_stop)
+    rgba, first, depth = _Draw.apply(*geometry, colors, channels[:, :most], shift, camera, background, early_stop)
     pieces = [first]
     nothing = background.new_zeros(3)
     for start in range(most, channels.shape[1], most + 3):  # the place of the colours takes three channels
         chunk = channels[:, start : start + most + 3]
         count = chunk.shape[1]
         chunk = torch.nn.functional.pad(chunk, (0, max(0, 3 - count)))
-        head, tail, _, _ = _Draw.apply(*geometry, chunk[:, :3], chunk[:, 3:], shift, camera, nothing, early_stop)
-        pieces.append(torch.cat([head, tail])[:count])
-    if screen_gradient is not None and rgb.requires_grad:
-        seen, radius = rgb.grad_fn.seen, rgb.grad_fn.radius
+        head, tail, _ = _Draw.apply(*geometry, chunk[:, :3], chunk[:, 3:], shift, camera, nothing, early_stop)
+        pieces.append(torch.cat([head[:3], tail])[:count])
+    if screen_gradient is not None and rgba.requires_grad:
+        state = rgba.grad_fn.state
         # ``shift`` moves the projected means of all passes, so its gradient is theirs.
-        shift.register_hook(lambda g: record_screen_gradient(screen_gradient, seen, g[seen], radius))
-    return rgb, depth, alpha, pieces[0] if len(pieces) == 1 else torch.cat(pieces)
+        shift.register_hook(lambda g: _record(state, g, screen_gradient))
+    return rgba, depth, pieces[0] if len(pieces) == 1 else torch.cat(pieces)
+
+
+def _record(state: "_State", gradient: Tensor, statistics: Tensor) -> None:
+    """What ``record_screen_gradient`` does, for those of the state that are seen."""
+    n = min(len(statistics), len(gradient))
+    record_screen_gradient(
+        _BUILD, gradient[:n].contiguous().numpy(), state.segments, state.record, state.record_stride, statistics.numpy()
+    )
 
 
 @dataclass
@@ -86,6 +89,7 @@ class _State:
     view: np.ndarray
     record: np.ndarray
     record_stride: int
+    segments: np.ndarray
     offsets: np.ndarray
     items: np.ndarray
     slots: np.ndarray
@@ -117,8 +121,8 @@ def _draw(
     camera: Camera,
     background: np.ndarray,
     early_stop: bool,
-) -> tuple[_State, np.ndarray]:
-    """Draw colours, channels, depth and alpha to ``state.image`` (3 + C + 2, H, W); and tell who is seen."""
+) -> _State:
+    """Draw colours, alpha, channels and depth to ``state.image`` (4 + C + 1, H, W)."""
     n, count = channels.shape
     planes = next(size for size in CHANNEL_SIZES if size >= count) + 4  # colours and depth
     build, view = _BUILD.with_planes(planes), _view(camera)
@@ -142,7 +146,7 @@ def _draw(
 
     backdrop = np.zeros(3 + count + 1, np.float32)
     backdrop[:3] = background
-    image = np.empty((3 + count + 2, height, width), np.float32)
+    image = np.empty((4 + count + 1, height, width), np.float32)
     floor = np.float32(TRANSMITTANCE_MIN if early_stop else 0)
     stops, tickets = np.empty(columns * rows, np.int64), np.zeros(1, np.int64)
     work = (tiles, width, height, record, stride, items, shapes, starts, stops, floor)
@@ -153,6 +157,7 @@ def _draw(
         view,
         record,
         stride,
+        segments,
         offsets,
         items,
         slots,
@@ -163,13 +168,13 @@ def _draw(
         image,
         floor,
         threads,
-    ), segments > 0
+    )
 
 
 def _undraw(state: _State, geometry: list[np.ndarray], g_image: list[np.ndarray]) -> list[np.ndarray]:
     """Gradients of means, quats, scales, opacities, colours, channels and projected means.
 
-    ``g_image`` are the gradients of the colours, channels, depth and alpha of the image.
+    ``g_image`` are the gradients of the colours with alpha, of the channels and of the depth of the image.
     """
     s, camera = state, state.camera
     n, count = len(geometry[0]), len(g_image[1])
@@ -196,23 +201,19 @@ class _Draw(torch.autograd.Function):
     def forward(ctx, means, quats, scales, opacities, colors, channels, shift, camera, background, early_stop):
         geometry = (means, quats, scales, opacities)
         arrays = [_numpy(t) for t in geometry]
-        state, seen = _draw(arrays, _numpy(colors), _numpy(channels), camera, _numpy(background), early_stop)
+        state = _draw(arrays, _numpy(colors), _numpy(channels), camera, _numpy(background), early_stop)
         image = state.image
-        outputs = [torch.from_numpy(p) for p in (image[:3], image[3:-2], image[-2], image[-1])]
+        outputs = [torch.from_numpy(p) for p in (image[:4], image[4:-1], image[-1])]
         ctx.state, ctx.shapes = state, [tuple(p.shape) for p in outputs]
         ctx.save_for_backward(*geometry, *outputs)  # outputs too: autograd then notices changes in place
         ctx.set_materialize_grads(False)
-        if shift.requires_grad:
-            extents = state.record.reshape(len(seen), -1)[seen, REC_EXTENT_X : REC_EXTENT_X + 2]
-            ctx.seen = torch.from_numpy(np.flatnonzero(seen))
-            ctx.radius = torch.from_numpy(extents.max(axis=1))
         return tuple(outputs)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, g_rgb, g_channels, g_depth, g_alpha):
+    def backward(ctx, g_rgba, g_channels, g_depth):
         state, geometry = ctx.state, [_numpy(t) for t in ctx.saved_tensors[:4]]
-        outputs = zip((g_rgb, g_channels, g_depth, g_alpha), ctx.shapes, strict=True)
+        outputs = zip((g_rgba, g_channels, g_depth), ctx.shapes, strict=True)
         g_image = [np.zeros(shape, np.float32) if g is None else _numpy(g) for g, shape in outputs]
         grads = _undraw(state, geometry, g_image)
         return *(torch.from_numpy(g) for g in grads), None, None, None

@@ -92,8 +92,8 @@ def rasterize(
     background: Tensor,
     early_stop: bool,
     screen_gradient: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """See ``hingesplat.render.rasterize``: rgb (3, H, W), depth (H, W), alpha (H, W), channels (C, H, W)."""
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See ``hingesplat.render.rasterize``: rgba (4, H, W), depth (H, W), channels (C, H, W)."""
     like = {"dtype": means.dtype, "device": means.device}
     world_to_camera = torch.as_tensor(camera.T_camera_world, **like)
     R = world_to_camera[:3, :3]
@@ -130,7 +130,7 @@ def rasterize(
         pieces.append(torch.cat([weight @ attributes, weight.sum(dim=1, keepdim=True)], dim=1))
     image = torch.cat(pieces).T.reshape(-1, camera.height, camera.width)
     rgb, others, depth, alpha = image.split([3, channels.shape[1], 1, 1])
-    return rgb + (1 - alpha) * background[:, None, None], depth[0], alpha[0], others
+    return torch.cat([rgb + (1 - alpha) * background[:, None, None], alpha]), depth[0], others
 
 
 def record_screen_gradient(statistics: Tensor, seen: Tensor, gradient: Tensor, radius: Tensor) -> None:
