@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import hingesplat  # before torch
+import hingesplat  # it says how torch's threads wait, so it precedes torch
+
+# isort: split
 import numba
 import torch
 

@@ -17,10 +17,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from common import machine, markdown, recorded, save, set_between  # it precedes torch
+
+# isort: split
 import numpy as np
 import torch
 import tyro
-from common import machine, markdown, recorded, save, set_between
 from peers import draw
 from torch import Tensor
 
@@ -216,7 +218,7 @@ def photographs(count: int, side: int) -> list[View]:
 
 
 def rasteriser_share(n: int, side: int) -> tuple[float, float]:
-    """Milliseconds of a training step, and the rasteriser's share of it: a real fit, from its first to its last step."""
+    """Milliseconds of a training step, and the rasteriser's share of it: of a real fit, first to last step."""
     spent, marks = [0.0], []
 
     def timed(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -276,13 +278,17 @@ def table(found: dict[str, Any]) -> str:
     lines = [markdown(head, rows), "", markdown(("ratio", ""), list(found["ratios"].items())), ""]
     lines += [f"{name} is left out: {why}.  " for name, why in found["absent"].items()]
     step = found["training step, ms of CPU time on one thread"]
-    return "\n".join([*lines, f"A training step takes {step} ms of CPU time on one thread.", f"Machine: {found['machine']}."])
+    return "\n".join(
+        [*lines, f"A training step takes {step} ms of CPU time on one thread.", f"Machine: {found['machine']}."]
+    )
 
 
 def worse(found: dict[str, float], known: dict[str, float]) -> list[str]:
     """A line for each ratio that is more than 15 % worse than recorded; what could not be measured is no worse."""
     return [
-        f"{name}: {found[name]}, was {before}" for name, before in known.items() if found.get(name, before) < WORSE * before
+        f"{name}: {found[name]}, was {before}"
+        for name, before in known.items()
+        if found.get(name, before) < WORSE * before
     ]
 
 

@@ -11,6 +11,7 @@ import torch
 from hingesplat.camera import Camera
 from hingesplat.capture import View, visual_hull
 from hingesplat.stereo import (
+    WITNESSES,
     Cloud,
     DepthMap,
     Picture,
@@ -23,6 +24,7 @@ from hingesplat.stereo import (
     seen_through,
     stereo,
     sweep,
+    witnesses,
 )
 from scenes import (
     in_the_hollow,
@@ -54,6 +56,15 @@ def maps() -> list[DepthMap]:
 
 
 # Whole photographs.
+
+
+def test_witnesses_are_all_of_few_and_an_even_pick_of_many() -> None:
+    assert list(witnesses(range(WITNESSES))) == list(range(WITNESSES))
+    for count in (WITNESSES + 1, 200, 400):
+        picked = np.array(witnesses(range(count)))
+        assert WITNESSES / 2 < len(picked) <= WITNESSES
+        assert len(set(np.diff(picked))) == 1 and count - picked[-1] <= np.diff(picked)[0]
+    assert list(witnesses([])) == []
 
 
 def test_confirmed_depth_is_right_and_mostly_there(maps: list[DepthMap]) -> None:

@@ -63,8 +63,16 @@ if wp is not None:
         half = view.R * Q * wp.diag(scales[i])
         u = wp.clamp(p[0] / z, view.limits[0], view.limits[1])
         v = wp.clamp(p[1] / z, view.limits[2], view.limits[3])
-        a = view.focal[0] / z * (wp.vec3(half[0, 0], half[0, 1], half[0, 2]) - u * wp.vec3(half[2, 0], half[2, 1], half[2, 2]))
-        b = view.focal[1] / z * (wp.vec3(half[1, 0], half[1, 1], half[1, 2]) - v * wp.vec3(half[2, 0], half[2, 1], half[2, 2]))
+        a = (
+            view.focal[0]
+            / z
+            * (wp.vec3(half[0, 0], half[0, 1], half[0, 2]) - u * wp.vec3(half[2, 0], half[2, 1], half[2, 2]))
+        )
+        b = (
+            view.focal[1]
+            / z
+            * (wp.vec3(half[1, 0], half[1, 1], half[1, 2]) - v * wp.vec3(half[2, 0], half[2, 1], half[2, 2]))
+        )
         c00 = wp.dot(a, a) + EPS
         c01 = wp.dot(a, b)
         c11 = wp.dot(b, b) + EPS
@@ -146,15 +154,17 @@ if wp is not None:
         y, x = wp.tid()
         tile = y / S * view.columns + x / S
         centre = wp.vec2(float(x) + 0.5, float(y) + 0.5)
-        t = float(1.0)
+        t = 1.0
         rgb = wp.vec3(0.0, 0.0, 0.0)
-        z = float(0.0)
+        z = 0.0
         end = int(starts[tile])
         for p in range(starts[tile], stops[tile]):
             g = items[p]
             d = centre - mean2[g]
             k = conic[g]
-            alpha = wp.min(A_MAX, opacities[g] * wp.exp(-0.5 * (k[0] * d[0] * d[0] + k[2] * d[1] * d[1]) - k[1] * d[0] * d[1]))
+            alpha = wp.min(
+                A_MAX, opacities[g] * wp.exp(-0.5 * (k[0] * d[0] * d[0] + k[2] * d[1] * d[1]) - k[1] * d[0] * d[1])
+            )
             if alpha >= A_MIN:
                 w = alpha * t
                 rgb += w * colors[g]
@@ -231,7 +241,11 @@ class Rasteriser:
         kinds = {"mean2": wp.vec2, "conic": wp.vec3, "depth": float, "spread": wp.vec2}
         with wp.ScopedDevice("cpu"):
             self.flat = {name: wp.zeros(n, dtype=kind, requires_grad=True) for name, kind in kinds.items()}
-            self.boxes, self.counts, self.ends = wp.zeros(n, dtype=wp.vec4i), wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
+            self.boxes, self.counts, self.ends = (
+                wp.zeros(n, dtype=wp.vec4i),
+                wp.zeros(n, dtype=int),
+                wp.zeros(n, dtype=int),
+            )
 
     def forward(self, *inputs: np.ndarray) -> np.ndarray:
         kinds = (wp.vec3, wp.vec4, wp.vec3, float, wp.vec3)
@@ -257,7 +271,7 @@ class Rasteriser:
         return self.image.numpy().copy()
 
     def backward(self, g_image: np.ndarray) -> list[np.ndarray]:
-        *geometry, opacities, colors = self.inputs
+        opacities, colors = self.inputs[3:]
         flat = self.flat
         with wp.ScopedDevice("cpu"):
             self.tape.zero()

@@ -108,7 +108,7 @@ class _CompileNotice(event.Listener):
     def on_start(self, event):
         if event.data["dispatcher"].py_func.__module__.startswith("hingesplat."):
             _forget_notice()
-            logger.info("compiling the CPU rasteriser (once, about 20 s) ...")
+            logger.info("compiling for this processor (once, about 40 s in all) ...")
 
     def on_end(self, event):
         pass

@@ -67,6 +67,10 @@ TRUNCATE = 0.2
 """Colour difference (mean of three channels) beyond which more is no worse."""
 
 
+WITNESSES = 64
+"""Depth maps that a point is held against where every map's points are."""
+
+
 @dataclass(frozen=True)
 class Cloud:
     """Points on a surface, evenly spread."""
@@ -294,14 +298,19 @@ def _winner(cost, inverse_planes, best, depth, thread, threads):  # pragma: no c
             depth[y, x] = 1 / (inverse_planes[p] + offset * (inverse_planes[1] - inverse_planes[0]))
 
 
+def witnesses(maps: Sequence[DepthMap]) -> Sequence[DepthMap]:
+    """At most WITNESSES of them, evenly picked: to hold each map against all would take the square of their number."""
+    return maps[:: -(-len(maps) // WITNESSES) or 1]
+
+
 def confirmed(index: int, maps: Sequence[DepthMap], tolerance: float, agree: int) -> np.ndarray:
     """One map's depth (h, w), 0 where fewer than ``agree`` others confirm it or twice as many see through."""
     m = maps[index]
     y, x = np.nonzero(m.depth > 0)
     points = m.camera.lifted(x, y, m.depth[y, x])
     same, through = np.zeros(len(points), int), np.zeros(len(points), int)
-    for k, other in enumerate(maps):
-        if k != index:
+    for other in witnesses(maps):
+        if other is not m:
             at, behind = _beyond(points, other)
             same[at] += np.abs(behind) < tolerance
             through[at] += behind > 2 * tolerance

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from statistics import fmean
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -22,14 +23,34 @@ REPORT_EVERY = 50
 """Steps."""
 
 
-@dataclass(frozen=True)
+KEPT_BYTES = 2**30
+"""Of targets as floats, twelve numbers a pixel; views beyond make theirs anew whenever they are asked."""
+_kept: WeakKeyDictionary["TrainingView", Target] = WeakKeyDictionary()
+
+
+@dataclass(frozen=True, eq=False)
 class TrainingView:
     """A photograph ready for the loop: cropped to the object, over white, with its alpha as a fourth plane."""
 
     camera: Camera
-    target: Target
-    image: Tensor
-    """(4, h, w): rgb over white, alpha."""
+    rgba: np.ndarray
+    """(h, w, 4) uint8, straight alpha: a window of the photograph, not a copy."""
+
+    @property
+    def target(self) -> Target:
+        """``image``, with what the loss needs of it."""
+        found = _kept.get(self)
+        if found is None:
+            rgba = torch.from_numpy(self.rgba.astype(np.float32) / 255).permute(2, 0, 1)
+            found = Target.of(torch.cat([rgba[:3] * rgba[3:] + 1 - rgba[3:], rgba[3:]]))
+            if found.nbytes + sum(t.nbytes for t in _kept.values()) <= KEPT_BYTES:
+                _kept[self] = found
+        return found
+
+    @property
+    def image(self) -> Tensor:
+        """(4, h, w): rgb over white, alpha."""
+        return self.target.image
 
 
 def training_view(view: View, margin: int = 8) -> TrainingView:
@@ -41,10 +62,8 @@ def training_view(view: View, margin: int = 8) -> TrainingView:
         rows, columns = np.array([0, height - 1]), np.array([0, width - 1])
     x0, x1 = max(columns[0] - margin, 0), min(columns[-1] + margin + 1, width)
     y0, y1 = max(rows[0] - margin, 0), min(rows[-1] + margin + 1, height)
-    rgba = torch.from_numpy(view.rgba[y0:y1, x0:x1].astype(np.float32) / 255).permute(2, 0, 1)
-    image = torch.cat([rgba[:3] * rgba[3:] + 1 - rgba[3:], rgba[3:]]).contiguous()
     camera = view.camera.cropped(int(x0), int(y0), int(x1 - x0), int(y1 - y0))
-    return TrainingView(camera, Target.of(image), image)
+    return TrainingView(camera, view.rgba[y0:y1, x0:x1])
 
 
 def averaged(report: Report, steps: int) -> Callable[[Tensor, Tensor, TrainingView, int], None]:

@@ -16,7 +16,7 @@ from hingesplat.capture import View
 from hingesplat.gaussians import Gaussians
 from hingesplat.render import render
 from hingesplat.simd import parallel
-from hingesplat.stereo import DepthMap, seen_through
+from hingesplat.stereo import DepthMap, seen_through, witnesses
 
 FREE, SURFACE, HIDDEN, COLOUR = range(4)
 """Columns of ``ask``'s answer."""
@@ -83,7 +83,7 @@ def _corrected(
     columns = ((np.arange(w) + 0.5) * own.depth.shape[1] / w).astype(int)
     known = own.depth[rows[:, None], columns]
     y, x = np.nonzero((rendered > 0) & (known == 0))
-    lid = seen_through(camera.lifted(x, y, rendered[y, x]), maps, tolerance) >= 2
+    lid = seen_through(camera.lifted(x, y, rendered[y, x]), witnesses(maps), tolerance) >= 2
     depth = np.where((rendered != 0) & (known > 0), known, rendered)
     depth[y[lid], x[lid]] = -1
     return depth
