@@ -3,8 +3,8 @@
     python benchmarks/growth.py [--page docs/performance.md] [--axes gaussians pixels views parts capture]
 
 Every size is a process of its own, on one thread: its jobs' seconds are medians of CPU time, its memory is the most
-that the process held. An exponent is the slope of log time over log size in the upper half of the sizes; n log n looks like
-1.1 here, so what exceeds 1.2 is told. Draws docs/growth.png and writes benchmarks/results/growth.json.
+that the process held. An exponent is the slope of log time over log size in the upper half of the sizes; n log n looks
+like 1.1 here, so what exceeds 1.2 is told. Draws docs/growth.png and writes benchmarks/results/growth.json.
 """
 
 import json
@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -200,8 +201,9 @@ def by_capture(count: int) -> Jobs:
     def look() -> None:
         for state in made["capture"].states:
             made[state.name] = [training_view(v) for v in state.train]
-        for view in (v for state in made["capture"].states for v in made[state.name]):
-            float(view.target.mean[0, 0, 0])
+        for state in made["capture"].states:
+            for photo in made[state.name]:
+                float(photo.target.mean[0, 0, 0])
 
     return {
         "load": load,
@@ -324,7 +326,7 @@ def figure(rows: dict[str, list[dict[str, Any]]], path: Path) -> None:
         things = work(axis, sizes)
         guide = things * np.log2(things) / (things[-1] * np.log2(things[-1])) * 10.0**top_value
         points = [at(s, v) for s, v in zip(sizes, guide, strict=True) if v >= 10.0**low]
-        for a, b in zip(points, points[1:], strict=False):
+        for a, b in pairwise(points):
             for f in np.arange(0, 1, 0.1):
                 p, q = ((a[i] + (b[i] - a[i]) * f, a[i] + (b[i] - a[i]) * (f + 0.05)) for i in (0, 1))
                 pen.line([(p[0], q[0]), (p[1], q[1])], fill="#777777", width=1)

@@ -281,13 +281,8 @@ def definition_as_gsplat(means, quats, scales, opacities, colors, viewmats, Ks, 
     geometry = ((centres - t) @ R, quats, scales, opacities)
     r = rasterize(*geometry, colors[:, :3], view, channels=colors[:, 3:], backend="torch")
     statistics = torch.zeros((len(means), 3), dtype=means.dtype)
-    rasterize(
-        *(a.detach().requires_grad_() for a in geometry),
-        colors[:, :3],
-        view,
-        backend="torch",
-        screen_gradient=statistics,
-    ).rgb.sum().backward()
+    alone = [a.detach().requires_grad_() for a in (*geometry, colors[:, :3])]
+    rasterize(*alone, view, backend="torch", screen_gradient=statistics).rgb.sum().backward()
     radii = statistics[:, 2:].expand(-1, 2)[None]
     image = torch.cat([r.rgb, r.channels, r.depth[None]]).permute(1, 2, 0)
     return image[None], r.alpha[None, :, :, None], {"means2d": means2d, "radii": radii}

@@ -298,9 +298,9 @@ def _winner(cost, inverse_planes, best, depth, thread, threads):  # pragma: no c
             depth[y, x] = 1 / (inverse_planes[p] + offset * (inverse_planes[1] - inverse_planes[0]))
 
 
-def witnesses(maps: Sequence[DepthMap]) -> Sequence[DepthMap]:
-    """At most WITNESSES of them, evenly picked: to hold each map against all would take the square of their number."""
-    return maps[:: -(-len(maps) // WITNESSES) or 1]
+def witnesses(count: int) -> range:
+    """At most WITNESSES of so many maps, evenly picked: each against all would take the square of their number."""
+    return range(0, count, max(-(-count // WITNESSES), 1))
 
 
 def confirmed(index: int, maps: Sequence[DepthMap], tolerance: float, agree: int) -> np.ndarray:
@@ -309,9 +309,9 @@ def confirmed(index: int, maps: Sequence[DepthMap], tolerance: float, agree: int
     y, x = np.nonzero(m.depth > 0)
     points = m.camera.lifted(x, y, m.depth[y, x])
     same, through = np.zeros(len(points), int), np.zeros(len(points), int)
-    for other in witnesses(maps):
-        if other is not m:
-            at, behind = _beyond(points, other)
+    for k in witnesses(len(maps)):
+        if k != index:
+            at, behind = _beyond(points, maps[k])
             same[at] += np.abs(behind) < tolerance
             through[at] += behind > 2 * tolerance
     keep = (same >= agree) & (same >= 0.5 * through)

@@ -83,7 +83,8 @@ def _corrected(
     columns = ((np.arange(w) + 0.5) * own.depth.shape[1] / w).astype(int)
     known = own.depth[rows[:, None], columns]
     y, x = np.nonzero((rendered > 0) & (known == 0))
-    lid = seen_through(camera.lifted(x, y, rendered[y, x]), witnesses(maps), tolerance) >= 2
+    others = [maps[k] for k in witnesses(len(maps))]
+    lid = seen_through(camera.lifted(x, y, rendered[y, x]), others, tolerance) >= 2
     depth = np.where((rendered != 0) & (known > 0), known, rendered)
     depth[y[lid], x[lid]] = -1
     return depth
