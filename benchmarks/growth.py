@@ -7,6 +7,7 @@ that the process held. An exponent is the slope of log time over log size in the
 like 1.1 here, so what exceeds 1.2 is told. Draws docs/growth.png and writes benchmarks/results/growth.json.
 """
 
+import atexit
 import json
 import subprocess
 import sys
@@ -93,6 +94,13 @@ def draw(g: Gaussians, side: int) -> None:
     (r.rgb.sum() + r.alpha.sum()).backward()
 
 
+def scratch() -> Path:
+    """A folder that goes when the process does."""
+    folder = tempfile.TemporaryDirectory(prefix="hingesplat-growth-")
+    atexit.register(folder.cleanup)
+    return Path(folder.name)
+
+
 def by_gaussians(n: int) -> Jobs:
     g, steps = gaussians(n), [learning(n) for _ in range(4)]
     statistics = torch.rand((n, 3))
@@ -118,7 +126,7 @@ def by_gaussians(n: int) -> Jobs:
 def by_pixels(side: int) -> Jobs:
     g, photo = gaussians(20_000), torch.rand((4, side, side))
     leaf, target = torch.rand((4, side, side)).requires_grad_(), Target.of(photo)
-    folder = Path(tempfile.mkdtemp(prefix="hingesplat-growth-"))
+    folder = scratch()
     views = photographs(4, side)
     for state in (0, 1):
         write_state(folder / f"state{state}", views, "train")
@@ -134,7 +142,7 @@ def by_views(count: int) -> Jobs:
     views = photographs(count, 96)
     g, config = gaussians(5_000), StereoConfig(image_size=64, planes=16)
     maps = stereo(views, config)
-    folder = Path(tempfile.mkdtemp(prefix="hingesplat-growth-"))
+    folder = scratch()
     for state in (0, 1):
         write_state(folder / f"state{state}", views, "train")
 
@@ -191,7 +199,7 @@ def big_capture(folder: Path, count: int) -> None:
 
 def by_capture(count: int) -> Jobs:
     """Each needs what those before it made."""
-    folder = Path(tempfile.mkdtemp(prefix="hingesplat-growth-"))
+    folder = scratch()
     big_capture(folder, count)
     made: dict[str, Any] = {}
 
@@ -232,24 +240,25 @@ def measure_here(axis: str, size: int) -> dict[str, Any]:
             start = time.process_time()
             job()
             times.append(time.process_time() - start)
-        seconds[name] = round(float(np.median(times[1:] or times)), 5)  # The first compiles, or loads what is compiled.
+        seconds[name] = round(float(np.median(times[1:] or times)), 5)  # The first loads what is compiled.
         peak[name] = peak_memory_mb()
     return {"size": size, "seconds": seconds, "peak_mb": peak, "mb_before": before}
 
 
 def measure(axis: str) -> list[dict[str, Any]]:
     rows = []
-    for size in SIZES[axis]:
+    warm_up = SIZES[axis][:1] if axis != "capture" else ()  # What it compiles, those after it find on disk.
+    for size in (*warm_up, *SIZES[axis]):
         sys.stderr.write(f"{axis} {size}\n")
         command = [sys.executable, __file__, "--child", axis, str(size)]
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
         rows.append(json.loads(done.stdout.splitlines()[-1]))
-    return rows
+    return rows[len(warm_up) :]
 
 
 def exponent(sizes: Sequence[float], values: Sequence[float]) -> float:
     """Slope of log value over log size in the upper half of the sizes."""
-    k = len(sizes) // 2
+    k = max(min(len(sizes) // 2, len(sizes) - 2), 0)
     return round(float(np.polyfit(np.log(sizes[k:]), np.log(np.maximum(values[k:], 1e-6)), 1)[0]), 2)
 
 

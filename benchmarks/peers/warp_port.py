@@ -154,9 +154,9 @@ if wp is not None:
         y, x = wp.tid()
         tile = y / S * view.columns + x / S
         centre = wp.vec2(float(x) + 0.5, float(y) + 0.5)
-        t = 1.0
+        t = float(1.0)  # noqa: UP018 (Warp's way to say that it varies)
         rgb = wp.vec3(0.0, 0.0, 0.0)
-        z = 0.0
+        z = float(0.0)  # noqa: UP018
         end = int(starts[tile])
         for p in range(starts[tile], stops[tile]):
             g = items[p]
