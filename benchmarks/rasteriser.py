@@ -219,7 +219,7 @@ def photographs(count: int, side: int) -> list[View]:
 
 def rasteriser_share(n: int, side: int) -> tuple[float, float]:
     """Milliseconds of a training step, and the rasteriser's share of it: of a real fit, first to last step."""
-    spent, marks = [0.0], []
+    spent, marks = [0.0], {}
 
     def timed(function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*args: Any) -> Any:
@@ -231,7 +231,7 @@ def rasteriser_share(n: int, side: int) -> tuple[float, float]:
         return call
 
     def report(step: int, **_: Any) -> None:
-        marks.append((step, time.process_time(), spent[0]))
+        marks.setdefault(step, (time.process_time(), spent[0]))
 
     normal = torch.nn.functional.normalize(torch.randn((n, 3), generator=torch.Generator().manual_seed(0)), dim=1)
     cloud = Cloud(0.5 * normal.numpy(), normal.numpy(), np.full((n, 3), 0.5))
@@ -244,7 +244,8 @@ def rasteriser_share(n: int, side: int) -> tuple[float, float]:
             fit(photographs(8, side), config, cloud=cloud, report=report)
     finally:
         engine._draw, engine._undraw = kept
-    (first, start, before), (last, end, after) = marks[0], marks[-1]
+    first, last = min(marks), max(marks)
+    (start, before), (end, after) = marks[first], marks[last]
     return 1e3 * (end - start) / (last - first), (after - before) / (end - start)
 
 

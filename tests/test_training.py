@@ -1,7 +1,5 @@
 """What the loops share: cropped photographs, depth variance, who is seen, growing."""
 
-from weakref import WeakKeyDictionary
-
 import numpy as np
 import pytest
 import torch
@@ -76,8 +74,8 @@ def test_an_empty_mask_keeps_the_whole_white_picture() -> None:
 def test_photographs_stay_bytes_where_floats_would_take_too_much(monkeypatch: pytest.MonkeyPatch) -> None:
     mask = np.ones((30, 40), bool)
     first, second = training_view(noise_view(mask)), training_view(noise_view(mask))
-    monkeypatch.setattr(training, "_kept", WeakKeyDictionary())
-    monkeypatch.setattr(training, "KEPT_BYTES", first.target.nbytes + 1)
+    monkeypatch.setattr(training, "_kept_bytes", 0)
+    monkeypatch.setattr(training, "KEPT_BYTES", 30 * 40 * 48 + 1)
     assert first.target is first.target
     assert second.target is not second.target
     assert torch.equal(second.target.mean, first.target.mean)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from statistics import fmean
-from weakref import WeakKeyDictionary
+from weakref import finalize
 
 import numpy as np
 import torch
@@ -25,32 +25,40 @@ REPORT_EVERY = 50
 
 KEPT_BYTES = 2**30
 """Of targets as floats, twelve numbers a pixel; views beyond make theirs anew whenever they are asked."""
-_kept: WeakKeyDictionary["TrainingView", Target] = WeakKeyDictionary()
+_kept_bytes = 0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class TrainingView:
     """A photograph ready for the loop: cropped to the object, over white, with its alpha as a fourth plane."""
 
     camera: Camera
     rgba: np.ndarray
     """(h, w, 4) uint8, straight alpha: a window of the photograph, not a copy."""
+    _target: Target | None = None
 
     @property
     def target(self) -> Target:
         """``image``, with what the loss needs of it."""
-        found = _kept.get(self)
-        if found is None:
-            rgba = torch.from_numpy(self.rgba.astype(np.float32) / 255).permute(2, 0, 1)
-            found = Target.of(torch.cat([rgba[:3] * rgba[3:] + 1 - rgba[3:], rgba[3:]]))
-            if found.nbytes + sum(t.nbytes for t in _kept.values()) <= KEPT_BYTES:
-                _kept[self] = found
-        return found
+        if self._target is not None:
+            return self._target
+        rgba = torch.from_numpy(self.rgba.astype(np.float32) / 255).permute(2, 0, 1)
+        target = Target.of(torch.cat([rgba[:3] * rgba[3:] + 1 - rgba[3:], rgba[3:]]))
+        if _kept_bytes + target.nbytes <= KEPT_BYTES:
+            _count_kept(target.nbytes)
+            finalize(self, _count_kept, -target.nbytes)
+            self._target = target
+        return target
 
     @property
     def image(self) -> Tensor:
         """(4, h, w): rgb over white, alpha."""
         return self.target.image
+
+
+def _count_kept(nbytes: int) -> None:
+    global _kept_bytes
+    _kept_bytes += nbytes
 
 
 def training_view(view: View, margin: int = 8) -> TrainingView:
