@@ -3,7 +3,9 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 PIP_INSTALL := $(BIN)/python -m pip install -c constraints.txt
 
-.PHONY: demo test lint bench web
+PAGE := docs/performance.md
+
+.PHONY: demo test lint bench bench-check profile web
 .DELETE_ON_ERROR:
 
 demo: .venv/stamp-run  ## make an object, photograph it in two states, rebuild it as a moving twin in demo/
@@ -18,8 +20,17 @@ lint: .venv/stamp-dev
 	$(BIN)/pyright
 	$(BIN)/lint-imports
 
-bench: .venv/stamp-dev  ## measure, write benchmarks/results/, and set the table in README.md
-	$(BIN)/python benchmarks/run.py --readme README.md
+bench: .venv/stamp-bench  ## measure everything, write benchmarks/results/, set the tables in README.md and docs/performance.md
+	$(BIN)/python benchmarks/rasteriser.py --page $(PAGE)
+	$(BIN)/python benchmarks/start.py --page $(PAGE)
+	$(BIN)/python benchmarks/growth.py --page $(PAGE)
+	$(BIN)/python benchmarks/run.py --readme README.md --page $(PAGE)
+
+bench-check: .venv/stamp-bench  ## measure the rasteriser again; fail where a ratio is over 15 % worse than recorded
+	$(BIN)/python benchmarks/rasteriser.py --check
+
+profile: .venv/stamp-dev  ## where the time of a whole run goes, stage by stage, into docs/performance.md
+	$(BIN)/python benchmarks/stages.py --page $(PAGE)
 
 web:  ## bundle the moving part of report.html anew, after a change in web/; needs Node.js
 	cd web && npm ci && npm run build
@@ -39,3 +50,7 @@ web:  ## bundle the moving part of report.html anew, after a change in web/; nee
 .venv/stamp-dev: .venv/stamp-torch pyproject.toml
 	$(PIP_INSTALL) -e '.[dev,sim,usd,splats,view,video]'
 	@touch $@ .venv/stamp-run
+
+.venv/stamp-bench: .venv/stamp-dev
+	$(PIP_INSTALL) -e '.[bench]'
+	@touch $@

@@ -18,10 +18,9 @@ from typing import Any, Literal
 
 import numpy as np
 import tyro
+from common import save
 from rich.console import Console
 from rich.table import Table
-
-RESULTS = Path(__file__).resolve().parent / "results"
 
 
 @dataclass(frozen=True)
@@ -141,14 +140,6 @@ def spread(values: Sequence[float | None], digits: int) -> str:
         return "–"
     text = f"{np.mean(there):.{digits}f}"
     return text if len(there) < 2 else f"{text} ± {np.std(there):.{digits}f}"
-
-
-def save(name: str, data: Any) -> Path:
-    """Write ``benchmarks/results/NAME.json``, whole or not at all."""
-    RESULTS.mkdir(exist_ok=True)
-    tmp = RESULTS / f"{name}.json.tmp"
-    tmp.write_text(json.dumps(data, indent=1))
-    return tmp.replace(RESULTS / f"{name}.json")
 
 
 def main() -> None:

@@ -1,14 +1,11 @@
-"""Measure everything: the rasteriser, the demo, and captures where a folder of them is given.
+"""Measure whole runs: the demo, and captures where a folder of them is given.
 
-    python benchmarks/run.py [--captures DIR] [--seeds 0 1 2] [--readme README.md]
+    python benchmarks/run.py [--captures DIR] [--seeds 0 1 2] [--readme README.md] [--page docs/performance.md]
 
-Writes ``benchmarks/results/*.json`` and sets the table between the marks in the README. Leave the machine
-alone meanwhile.
+Writes ``benchmarks/results/*.json`` and sets the table between the marks in the README, and that of the demo's stages
+in the page. Leave the machine alone meanwhile.
 """
 
-import json
-import os
-import platform
 import tempfile
 import time
 from collections.abc import Sequence
@@ -16,14 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import bench_rasteriser
-import torch
+import stages
 import tyro
-from captures import RESULTS, by_capture, call, cells, measure_all, results, save
 from captures import Options as CaptureOptions
+from captures import by_capture, call, cells, measure_all, results
+from common import machine, recorded, save, set_between
 from rich.console import Console
 
-START, END = "<!-- results -->", "<!-- /results -->"
 LEFT_OUT = ("fit s", "segment s", "joint s", "rest s")
 """Columns of ``captures.cells`` that the README does without."""
 
@@ -37,20 +33,24 @@ class Options:
     seeds: tuple[int, ...] = (0, 1, 2)
     readme: Path | None = None
     """File whose table is set."""
+    page: Path | None = None
+    """Page whose table of stages is set."""
     recorded: bool = False
     """Measure nothing: set the table from what ``benchmarks/results/`` holds."""
 
 
-def demo() -> list[dict[str, Any]]:
-    """The demo twice, in processes of their own: the second run has everything compiled."""
-    rows = []
+def demo() -> dict[str, Any]:
+    """The demo twice, in processes of their own: the second run has everything compiled, and is what is told."""
     with tempfile.TemporaryDirectory(prefix="hingesplat-demo-") as folder:
         for _ in range(2):
             started = time.perf_counter()
             error = call("demo", "--out", folder)
-            row = {"capture": "demo", "wall_seconds": round(time.perf_counter() - started, 1)}
-            rows.append(row | ({"error": error} if error else results(Path(folder) / "run")))
-    return rows
+            row: dict[str, Any] = {"capture": "demo", "wall_seconds": round(time.perf_counter() - started, 1)}
+        if error:
+            return row | {"error": error}
+        run = Path(folder) / "run"
+        save("stages", {"machine": machine(), **stages.stages_of(run), "wall_seconds": row["wall_seconds"]})
+        return row | results(run)
 
 
 def markdown(rows: Sequence[dict[str, Any]]) -> str:
@@ -72,36 +72,20 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join([*table, "", *notes])
 
 
-def machine() -> str:
-    processor = f"{os.cpu_count()} × {platform.machine()}"
-    return f"{processor}, Python {platform.python_version()}, torch {torch.__version__}"
-
-
-def set_table(readme: Path, table: str) -> None:
-    """Replace what stands between the two marks."""
-    text = readme.read_text()
-    if START not in text or END not in text:
-        raise SystemExit(f"{readme}: lacks the marks {START} and {END}")
-    before, after = text.split(START)[0], text.split(END)[1]
-    tmp = readme.with_name(readme.name + ".tmp")
-    tmp.write_text(f"{before}{START}\n{table}\n{END}{after}")
-    tmp.replace(readme)
-
-
 def main() -> None:
     options = tyro.cli(Options, description=__doc__)
     console = Console()
     if not options.recorded:
-        bench_rasteriser.main()
-        save("demo", demo()[-1:])
+        save("demo", [demo()])
         if options.captures is not None:
             save("captures", measure_all(CaptureOptions(options.captures, seeds=options.seeds), console))
-    files = [RESULTS / f"{name}.json" for name in ("demo", "captures")]
-    rows = [row for file in files if file.is_file() for row in json.loads(file.read_text())]
+    rows = [row for name in ("demo", "captures") for row in recorded(name) or []]
     table = markdown(rows)
     console.print(table, soft_wrap=True, markup=False)
     if options.readme is not None:
-        set_table(options.readme, table)
+        set_between(options.readme, "results", table)
+    if options.page is not None and (found := recorded("stages")) is not None:
+        set_between(options.page, "stages", stages.table(found))
 
 
 if __name__ == "__main__":

@@ -103,6 +103,18 @@ def test_the_window_is_the_published_one():
     assert (row[21] / row[20]).item() == pytest.approx(math.exp(-0.5 / 1.5**2))
 
 
+@pytest.mark.parametrize("size", [(3, 40, 37), (1, 5, 3), (4, 70, 130)])
+def test_the_statistics_of_a_photograph_are_those_of_the_definition(size):
+    y = torch.rand(size, generator=torch.Generator().manual_seed(2))
+    exact, before = Target.of(y.double()), torch.get_num_threads()
+    for threads in (1, 3):
+        torch.set_num_threads(threads)
+        found = Target.of(y)
+        torch.set_num_threads(before)
+        torch.testing.assert_close(found.mean.double(), exact.mean, atol=1e-6, rtol=0)
+        torch.testing.assert_close(found.variance.double(), exact.variance, atol=1e-6, rtol=0)
+
+
 def test_upstream_gradient_scales_and_non_contiguous_images_work():
     x, y = pair()
     _, expected = value_and_gradient(x, y, 0.2)

@@ -11,6 +11,7 @@ import torch
 from hingesplat.camera import Camera
 from hingesplat.capture import View, visual_hull
 from hingesplat.stereo import (
+    WITNESSES,
     Cloud,
     DepthMap,
     Picture,
@@ -23,6 +24,7 @@ from hingesplat.stereo import (
     seen_through,
     stereo,
     sweep,
+    witnesses,
 )
 from scenes import (
     in_the_hollow,
@@ -54,6 +56,13 @@ def maps() -> list[DepthMap]:
 
 
 # Whole photographs.
+
+
+def test_witnesses_are_all_of_few_and_an_even_pick_of_many() -> None:
+    assert list(witnesses(0)) == [] and list(witnesses(WITNESSES)) == list(range(WITNESSES))
+    for count in (WITNESSES + 1, 200, 400):
+        picked = witnesses(count)
+        assert WITNESSES / 2 < len(picked) <= WITNESSES and count - picked[-1] <= picked.step
 
 
 def test_confirmed_depth_is_right_and_mostly_there(maps: list[DepthMap]) -> None:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from hingesplat import training
 from hingesplat.camera import Camera
 from hingesplat.capture import View
 from hingesplat.gaussians import Gaussians, concatenate
@@ -66,6 +67,18 @@ def test_an_empty_mask_keeps_the_whole_white_picture() -> None:
     view = training_view(noise_view(np.zeros((30, 40), bool)))
     assert view.image.shape == (4, 30, 40)
     assert torch.equal(view.image[:3], torch.ones((3, 30, 40)))
+
+
+def test_photographs_stay_bytes_where_floats_would_take_too_much(monkeypatch: pytest.MonkeyPatch) -> None:
+    mask = np.ones((30, 40), bool)
+    first, second = training_view(noise_view(mask)), training_view(noise_view(mask))
+    monkeypatch.setattr(training, "_kept_bytes", 0)
+    monkeypatch.setattr(training, "KEPT_BYTES", 30 * 40 * 48 + 1)
+    assert first.target is first.target
+    assert second.target is not second.target
+    assert torch.equal(second.target.mean, first.target.mean)
+    del first  # Its room is free again.
+    assert second.target is second.target
 
 
 def drawn_variance(gaussians: Gaussians) -> torch.Tensor:

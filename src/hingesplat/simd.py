@@ -105,21 +105,18 @@ def _unbox_build(typ, value, c):
 class _CompileNotice(event.Listener):
     """Says once that a kernel of this package is being compiled."""
 
+    said = False
+
     def on_start(self, event):
-        if event.data["dispatcher"].py_func.__module__.startswith("hingesplat."):
-            _forget_notice()
-            logger.info("compiling the CPU rasteriser (once, about 20 s) ...")
+        if not self.said and event.data["dispatcher"].py_func.__module__.startswith("hingesplat."):
+            self.said = True
+            logger.info("compiling for this processor (once, about 40 s in all) ...")
 
     def on_end(self, event):
         pass
 
 
-_notice = _CompileNotice()
-event.register("numba:compile", _notice)
-
-
-def _forget_notice() -> None:
-    event.unregister("numba:compile", _notice)
+event.register("numba:compile", _CompileNotice())
 
 
 _pool: ThreadPoolExecutor | None = None

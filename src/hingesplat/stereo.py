@@ -68,6 +68,10 @@ TRUNCATE = 0.2
 """Colour difference (mean of three channels) beyond which more is no worse."""
 
 
+WITNESSES = 64
+"""Depth maps that a point is held against where every map's points are."""
+
+
 @dataclass(frozen=True)
 class Cloud:
     """Points on a surface, evenly spread."""
@@ -309,12 +313,18 @@ def _winner(cost, inverse_planes, best, depth, thread, threads):  # pragma: no c
             depth[y, x] = 1 / (inverse_planes[p] + offset * (inverse_planes[1] - inverse_planes[0]))
 
 
+def witnesses(count: int) -> range:
+    """At most WITNESSES of so many maps, evenly picked: each against all would take the square of their number."""
+    return range(0, count, max(-(-count // WITNESSES), 1))
+
+
 def confirmed(index: int, maps: Sequence[DepthMap], tolerance: float, agree: int) -> np.ndarray:
     """One map's depth (h, w), 0 where fewer than ``agree`` others confirm it or twice as many see through."""
     m = maps[index]
     y, x = np.nonzero(m.depth > 0)
     points = m.camera.lifted(x, y, m.depth[y, x])
-    same, through = _votes(points, [*maps[:index], *maps[index + 1 :]], tolerance)
+    others = [maps[k] for k in witnesses(len(maps)) if k != index]
+    same, through = _votes(points, others, tolerance)
     keep = (same >= agree) & (same >= 0.5 * through)
     depth = np.zeros_like(m.depth)
     depth[y[keep], x[keep]] = m.depth[y[keep], x[keep]]

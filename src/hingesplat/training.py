@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 from typing import Protocol
+from weakref import finalize
 
 import numpy as np
 import torch
@@ -24,14 +25,42 @@ REPORT_EVERY = 50
 """Steps."""
 
 
-@dataclass(frozen=True)
+KEPT_BYTES = 2**30
+"""Of targets as floats, twelve numbers a pixel; views beyond make theirs anew whenever they are asked."""
+_kept_bytes = 0
+
+
+@dataclass(eq=False)
 class TrainingView:
     """A photograph ready for the loop: cropped to the object, over white, with its alpha as a fourth plane."""
 
     camera: Camera
-    target: Target
-    image: Tensor
-    """(4, h, w): rgb over white, alpha."""
+    rgba: np.ndarray
+    """(h, w, 4) uint8, straight alpha: a window of the photograph, not a copy."""
+    _target: Target | None = None
+
+    @property
+    def target(self) -> Target:
+        """``image``, with what the loss needs of it."""
+        if self._target is not None:
+            return self._target
+        rgba = torch.from_numpy(self.rgba.astype(np.float32) / 255).permute(2, 0, 1)
+        target = Target.of(torch.cat([rgba[:3] * rgba[3:] + 1 - rgba[3:], rgba[3:]]))
+        if _kept_bytes + target.nbytes <= KEPT_BYTES:
+            _count_kept(target.nbytes)
+            finalize(self, _count_kept, -target.nbytes)
+            self._target = target
+        return target
+
+    @property
+    def image(self) -> Tensor:
+        """(4, h, w): rgb over white, alpha."""
+        return self.target.image
+
+
+def _count_kept(nbytes: int) -> None:
+    global _kept_bytes
+    _kept_bytes += nbytes
 
 
 def training_view(view: View, margin: int = 8) -> TrainingView:
@@ -43,10 +72,8 @@ def training_view(view: View, margin: int = 8) -> TrainingView:
         rows, columns = np.array([0, height - 1]), np.array([0, width - 1])
     x0, x1 = max(columns[0] - margin, 0), min(columns[-1] + margin + 1, width)
     y0, y1 = max(rows[0] - margin, 0), min(rows[-1] + margin + 1, height)
-    rgba = torch.from_numpy(view.rgba[y0:y1, x0:x1].astype(np.float32) / 255).permute(2, 0, 1)
-    image = torch.cat([rgba[:3] * rgba[3:] + 1 - rgba[3:], rgba[3:]]).contiguous()
     camera = view.camera.cropped(int(x0), int(y0), int(x1 - x0), int(y1 - y0))
-    return TrainingView(camera, Target.of(image), image)
+    return TrainingView(camera, view.rgba[y0:y1, x0:x1])
 
 
 def averaged(report: Report, steps: int) -> Callable[[Tensor, Tensor, int], None]:

@@ -18,7 +18,7 @@ from hingesplat.capture import View
 from hingesplat.gaussians import Gaussians
 from hingesplat.render import render
 from hingesplat.simd import parallel
-from hingesplat.stereo import DepthMap, seen_through
+from hingesplat.stereo import DepthMap, seen_through, witnesses
 
 FREE, SURFACE, HIDDEN, COLOUR = range(4)
 """Columns of ``ask``'s answer."""
@@ -46,7 +46,7 @@ class Sight:
         """
         near = minimum_filter(np.where(self.depth > 0, self.depth, np.inf), (1, 3, 3))
         far = maximum_filter(np.maximum(self.depth, 0), (1, 3, 3))
-        off = minimum_filter(self.depth == 0, (1, 3, 3))
+        off = np.asarray(minimum_filter(self.depth == 0, (1, 3, 3)), bool)
         return np.stack([np.where((far > 0) | off, near, 0), np.where(off, np.inf, far)], -1).astype(np.float32)
 
 
@@ -97,7 +97,8 @@ def _corrected(
     columns = ((np.arange(w) + 0.5) * own.depth.shape[1] / w).astype(int)
     known = own.depth[rows[:, None], columns]
     y, x = np.nonzero((rendered > 0) & (known == 0))
-    lid = seen_through(camera.lifted(x, y, rendered[y, x]), maps, tolerance) >= 2
+    others = [maps[k] for k in witnesses(len(maps))]
+    lid = seen_through(camera.lifted(x, y, rendered[y, x]), others, tolerance) >= 2
     depth = np.where((rendered != 0) & (known > 0), known, rendered)
     depth[y[lid], x[lid]] = -1
     return depth

@@ -56,13 +56,23 @@ class Target:
     variance: Tensor
     """(C, height, width) local variance."""
 
+    @property
+    def nbytes(self) -> int:
+        return self.image.nbytes + self.mean.nbytes + self.variance.nbytes
+
     @staticmethod
     def of(image: Tensor) -> "Target":
         """Blur ``image`` (C, height, width) once for all."""
-        exact = image.detach().double()
+        image = image.detach().contiguous()
+        if _fusible(image):
+            threads, (mean, variance) = torch.get_num_threads(), (torch.empty_like(image) for _ in range(2))
+            flat = (t.numpy().reshape(-1) for t in (image, mean, variance))
+            parallel(_mean_and_variance, threads, _BUILD, *flat, tuple(image.shape))
+            return Target(image, mean, variance)
+        exact = image.double()
         mean = _blur_once(exact)
         variance = _blur_once(exact * exact) - mean * mean
-        return Target(image.detach().contiguous(), mean.to(image), variance.to(image))
+        return Target(image, mean.to(image), variance.to(image))
 
 
 def photometric(image: Tensor, target: Target, ssim_weight: float = 0.2) -> Tensor:
@@ -95,7 +105,7 @@ def picture_loss(
     """
     if image.shape != target.image.shape:
         raise ValueError(f"image: shape {tuple(image.shape)}, but its target has {tuple(target.image.shape)}")
-    if image.device.type == "cpu" and image.dtype == torch.float32 and image.numel():
+    if _fusible(image):
         return _Fused.apply(image, target, ssim_weight, *(depths or (None, None)), variance_weight)
     difference = image - target.image
     loss = (1 - ssim_weight) * difference.abs().mean() + ssim_weight * (1 - ssim_map(image, target).mean())
@@ -113,6 +123,11 @@ def depth_variance(alpha: Tensor, depth: Tensor, squared_depth: Tensor) -> Tenso
     weight = torch.where(covered, alpha, 1)
     variance = (squared_depth / weight - (depth / weight).square()).clamp_min(0)
     return (variance * covered).mean()
+
+
+def _fusible(image: Tensor) -> bool:
+    """Whether the kernels below can take it."""
+    return image.device.type == "cpu" and image.dtype == torch.float32 and image.numel() > 0
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:
@@ -222,6 +237,40 @@ def _average_source(x, y, p, width, rows, padded, planes, plane, q, scratch):
         vstore(rows, padded + _MARGIN + c, a * a)
         vstore(rows, 2 * padded + _MARGIN + c, a * b)
     _average_rows(rows, padded, planes, plane, q, width)
+
+
+@njit(**KERNEL)
+def _mean_and_variance(build, image, mean, variance, size, t, threads):
+    """Of the window about every pixel; bands as in ``_loss_and_gradient``."""
+    channels, height, width = size
+    pitch = (width + LANES - 1) // LANES * LANES
+    padded, plane = pitch + 2 * _MARGIN, (_STEP + _LAG) * pitch
+    scratch, rows, averages = (
+        np.empty(LANES, np.float32),
+        np.zeros(3 * padded, np.float32),
+        np.zeros(3 * plane, np.float32),
+    )
+    for job in range(t, channels * threads, threads):
+        channel, band = job // threads, job % threads
+        first, last = band * height // threads, (band + 1) * height // threads
+        for start in range(first - RADIUS, last + RADIUS, _STEP):
+            for i in range(_STEP):
+                r, q = start + i, (_LAG + i) * pitch
+                if 0 <= r < height:
+                    p = (channel * height + r) * width
+                    _average_source(image, image, p, width, rows, padded, averages, plane, q, scratch)
+                else:
+                    for k in range(3):
+                        for c in range(0, pitch, LANES):
+                            vstore(averages, k * plane + q + c, vsplat(_0))
+            for i in range(_STEP):
+                r, q = start - RADIUS + i, (RADIUS + i) * pitch
+                if first <= r < last:
+                    for c in range(0, width, LANES):
+                        p, m = (channel * height + r) * width + c, _average(averages, q + c, pitch)
+                        _store(mean, p, width - c, m, scratch)
+                        _store(variance, p, width - c, _average(averages, plane + q + c, pitch) - m * m, scratch)
+            _keep_last(averages, plane, pitch)
 
 
 @njit(**INNER)

@@ -26,7 +26,14 @@ _HALF, _0, _1 = np.float32(0.5), np.float32(0), np.float32(1)
 _LOG2_ALPHA_MIN = np.float32(math.log2(ALPHA_MIN))
 _TINY = np.float32(1e-6)
 
+_TILE_BITS = TILE.bit_length() - 1
 _DIGIT = 11  # bits that one pass of the radix sort looks at
+
+
+@njit(**INLINE)
+def tile_of(x):
+    """Row or column of tiles that pixel x ≥ 0 lies in; // would provide for negative numbers."""
+    return np.int64(x) >> _TILE_BITS
 
 
 @njit(**INLINE)
@@ -43,11 +50,12 @@ def count_segments(first, last, boxes, segments, histogram, width):
         x0, x1 = sload(boxes, 4 * i), sload(boxes, 4 * i + 1)
         total = 0
         if x1 >= x0:
-            row0, row1 = sload(boxes, 4 * i + 2) // TILE, sload(boxes, 4 * i + 3) // TILE
-            for column in range(x0 // TILE, x1 // TILE + 1):
+            row0, row1 = tile_of(sload(boxes, 4 * i + 2)), tile_of(sload(boxes, 4 * i + 3))
+            for column in range(tile_of(x0), tile_of(x1) + 1):
                 count = _segments_in_column(x0, x1, column)
                 total += count
-                for tile in range(row0 * columns + column, row1 * columns + column + 1, columns):
+                for row in range(row0, row1 + 1):  # a range in steps would divide
+                    tile = row * columns + column
                     sstore(histogram, tile, sload(histogram, tile) + count)
             total *= row1 - row0 + 1
         sstore(segments, i, total)
@@ -132,12 +140,12 @@ def _list_segments(g, box, row0, row1, columns, record, stride, slot0, cursor, b
     a, b, c = sload(record, o + REC_A), sload(record, o + REC_B), sload(record, o + REC_C)
     spread = sload(record, o + REC_LOG_OPACITY) - _LOG2_ALPHA_MIN
     reach_x, reach_y = max(sload(record, o + REC_EXTENT_X), _TINY), sload(record, o + REC_EXTENT_Y)
-    first_row, last_row = y0 // TILE, y1 // TILE
+    first_row, last_row = tile_of(y0), tile_of(y1)
     per_row = 0
-    for column in range(x0 // TILE, x1 // TILE + 1):
+    for column in range(tile_of(x0), tile_of(x1) + 1):
         per_row += _segments_in_column(x0, x1, column)
     done = 0  # segments of a tile row to the left of this one
-    for column in range(x0 // TILE, x1 // TILE + 1):
+    for column in range(tile_of(x0), tile_of(x1) + 1):
         end = min(x1, column * TILE + TILE - 1)
         for x in range(max(x0, column * TILE), end + 1, LANES):
             left, right = np.float32(x) + _HALF - mx, np.float32(min(x + LANES - 1, end)) + _HALF - mx
@@ -178,12 +186,13 @@ def fill_lists(
     for j in range(visible):
         g = np.int64(sload(order, j))
         y0, y1 = np.int64(sload(boxes, 4 * g + 2)), np.int64(sload(boxes, 4 * g + 3))
-        if y0 // TILE >= row1 or y1 // TILE < row0:
+        first, last = tile_of(y0), tile_of(y1)
+        if first >= row1 or last < row0:
             continue
         x0, x1 = np.int64(sload(boxes, 4 * g)), np.int64(sload(boxes, 4 * g + 1))
         slot0 = np.int64(sload(offsets, g))
-        if x0 // TILE == x1 // TILE and y0 // TILE == y1 // TILE and x1 - x0 < LANES:  # the common case
-            tile = y0 // TILE * columns + x0 // TILE - base
+        if tile_of(x0) == tile_of(x1) and first == last and x1 - x0 < LANES:  # the common case
+            tile = first * columns + tile_of(x0) - base
             p = cursor[tile]
             cursor[tile] = p + 1
             sstore(items, p, g)

@@ -1,5 +1,8 @@
 """The CUDA engine: gsplat 1.5.3 (Ye et al. 2024, Apache-2.0), an optional dependency."""
 
+from collections.abc import Callable
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -27,15 +30,7 @@ def rasterize(
     Raises:
         HingesplatError: no CUDA device, tensors that are not on it, or gsplat is not installed.
     """
-    if not torch.cuda.is_available():
-        raise HingesplatError("backend gsplat: no CUDA device; use the numba or torch backend")
-    if not means.is_cuda:
-        raise HingesplatError("backend gsplat: needs CUDA tensors; move them, or use the numba or torch backend")
-    try:
-        from gsplat import rasterization  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise HingesplatError("backend gsplat: not installed; run pip install 'hingesplat[gsplat]'") from error
-
+    rasterization = _gsplat(means)
     if len(means) == 0:  # gsplat wants at least one
         blank = means.sum() + means.new_zeros((channels.shape[1] + 5, camera.height, camera.width))
         return torch.cat([blank[:3] + background[:, None, None], blank[3:4]]), blank[4], blank[5:]
@@ -47,7 +42,7 @@ def rasterize(
         opacities,
         torch.cat([colors, channels], dim=1),
         torch.as_tensor(camera.T_camera_world).to(means)[None],
-        torch.tensor(intrinsics).to(means)[None],
+        torch.tensor(intrinsics, dtype=means.dtype, device=means.device)[None],
         camera.width,
         camera.height,
         near_plane=NEAR,
@@ -63,3 +58,16 @@ def rasterize(
     alpha = alpha[0, :, :, 0]
     rgb, others, depth = image[0].permute(2, 0, 1).split([3, channels.shape[1], 1])
     return torch.cat([rgb + (1 - alpha) * background[:, None, None], alpha[None]]), depth[0], others
+
+
+def _gsplat(means: Tensor) -> Callable[..., Any]:
+    """gsplat's rasteriser, where it can work on ``means``."""
+    if not torch.cuda.is_available():
+        raise HingesplatError("backend gsplat: no CUDA device; use the numba or torch backend")
+    if not means.is_cuda:
+        raise HingesplatError("backend gsplat: needs CUDA tensors; move them, or use the numba or torch backend")
+    try:
+        from gsplat import rasterization  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise HingesplatError("backend gsplat: not installed; run pip install 'hingesplat[gsplat]'") from error
+    return rasterization
