@@ -315,8 +315,9 @@ def parse(args: list[str]) -> Command:
 
 
 def parse_reconstruct(args: list[str]) -> Reconstruct:
-    """The options of ``reconstruct`` with those of every stage; their defaults are the preset's."""
-    from hingesplat.pipeline import ReconstructConfig, preset
+    """The options of ``reconstruct`` with those of every stage; their defaults are the preset's and the method's."""
+    from hingesplat.methods import configure
+    from hingesplat.pipeline import ReconstructConfig
 
     def parsed(default: ReconstructConfig) -> Any:
         nested: Any = Annotated[ReconstructConfig, tyro.conf.arg(name="")]
@@ -326,8 +327,8 @@ def parse_reconstruct(args: list[str]) -> Reconstruct:
         return tyro.cli(full, args=args, prog=prog, description=Reconstruct.__doc__, config=FLAGS)
 
     command = parsed(ReconstructConfig())
-    named = command.config.preset
-    return command if named == "standard" else parsed(preset(named))
+    default = configure(command.config.method, command.config.preset)
+    return command if default == ReconstructConfig() else parsed(default)
 
 
 def _reconstruct(capture: Any, config: Any, out: Path, overwrite: bool, console: Console) -> "Twin":
