@@ -96,7 +96,7 @@ OPTIONS = {
     "embedding to the end": ArticulateConfig(identity=IdentityConfig("embedding", hard_from=0.9)),
     "centres": ArticulateConfig(identity=IdentityConfig("centres", hard_from=0.9)),
     "repel": ArticulateConfig(repel=RepelConfig(points=200)),
-    "repel, dynamic and noisy": ArticulateConfig(repel=RepelConfig(points=200, refresh=4, noise=0.01, nearest=0)),
+    "repel, dynamic and noisy": ArticulateConfig(repel=RepelConfig(points=200, refresh=0.25, noise=0.01, nearest=0)),
     "art": ArticulateConfig(physics=PhysicsConfig(art=1.0)),
     "art, matched": ArticulateConfig(physics=PhysicsConfig(art=1.0, targets="matched")),
     "contact": ArticulateConfig(physics=PhysicsConfig(contact=0.5)),

@@ -30,8 +30,9 @@ class RepelConfig:
     """Base closer than this to a movable part may get points."""
     noise: float = 0.0
     """σ_r of the points' places (table 11)."""
-    refresh: int = 0
-    """Steps after which points are drawn anew; 0 keeps the first ones (paper: 0; its dynamic variant 5000; table 12)."""
+    refresh: float = 0.0
+    """Fraction of the run after which points are drawn anew; 0 keeps the first (paper; its dynamic variant: 0.2, which
+    is 5 000 steps of 25 000; table 12)."""
     since: float = 0.0
     """Fraction of the run after which points are drawn: from a random start, parts have to form first."""
     strength: float = 5e-4
@@ -67,8 +68,8 @@ class PhysicsConfig:
     targets: Literal["nearest", "matched"] = "nearest"
     """μ¹ in L_art and L_vector. nearest: the state's Gaussian closest to the moved one, found anew every 200 steps.
     matched: one to one, found once on the Gaussians where they stand (paper)."""
-    matched: int = 5000
-    """matched: Gaussians of each side that are paired."""
+    matched: int = 3000
+    """matched: Gaussians of each side that are paired (Hungarian, cubic in this number)."""
 
     @property
     def aims(self) -> bool:
@@ -104,7 +105,7 @@ class Repulsion:
         c = self.config
         if c.points == 0 or step < c.since * steps:
             return
-        if self.drawn < 0 or (c.refresh and step - self.drawn >= c.refresh):
+        if self.drawn < 0 or (c.refresh and step - self.drawn >= c.refresh * steps):
             self.points, self.drawn = draw_repel_points(g, c, self.generator), step
 
     def pushed(self, means: Tensor, movable: Tensor) -> Tensor:
@@ -136,10 +137,10 @@ class Targets:
         self.extra: dict[str, tuple[Tensor, float]] = {}
         if self.fitted and config.targets == "matched":
             places = torch.full((len(g), len(fitted), 3), torch.nan)
-            for state, own in enumerate(fitted):
-                rng = np.random.default_rng(seed)
-                i, j = one_to_one(g.means.numpy(), own.means.numpy(), config.matched, rng)
-                places[i, state] = own.means[j]
+            for state in range(1, len(fitted)):
+                rng, own = np.random.default_rng(seed), fitted[state].means
+                i, j = one_to_one(g.means.numpy(), own.numpy(), config.matched, rng)
+                places[i, state] = own[j]
             # A value that is never stepped: its rows follow the Gaussians when they are split and sorted.
             self.extra = {"target": (places, 0.0)}
 
@@ -149,7 +150,7 @@ class Targets:
 
     @torch.no_grad()
     def at(self, optimiser: GaussianAdam, p: Tensor | None, R: Tensor, t: Tensor, state: int, step: int) -> Aim | None:
-        """The targets of one state; R (states, K, 3, 3) and t (states, K, 3)."""
+        """The targets of one moved state; R (states, K, 3, 3) and t (states, K, 3)."""
         if not self.fitted:
             return None
         if self.extra:

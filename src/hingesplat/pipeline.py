@@ -180,6 +180,7 @@ def reconstruct(
     *,
     out: Path | None = None,
     overwrite: bool = False,
+    parents: Sequence[Path] = (),
     report: Report = lambda **_: None,
 ) -> Twin:
     """Photographs of an object in two or more states to a twin of it that moves.
@@ -190,6 +191,8 @@ def reconstruct(
         out: the run folder, made if absent; a run of the same capture and config goes on after its last
             finished stage. A new temporary folder, named in the log, if None.
         overwrite: start afresh where ``out`` holds another run.
+        parents: run folders of the same capture; a new run takes over the first stages of the one whose config
+            agrees with its own the longest, times and all.
         report: called with ``stage`` when a stage begins, with ``stage, seconds`` when it ends, and between
             with ``stage, step, steps, loss, psnr, gaussians`` (and ``state`` while fitting).
 
@@ -205,6 +208,7 @@ def reconstruct(
     capture = _capped(capture, config.max_size)
     folder = Path(tempfile.mkdtemp(prefix="hingesplat-")) if out is None else Path(out)
     _open(folder, capture, config, overwrite)
+    _take_over(folder, parents)
     curves = Curves(folder / "curves.json", report)
     run = Run(folder, capture, config, curves.report)
     try:
@@ -443,6 +447,17 @@ STAGES: dict[str, Callable[[Run], None]] = {
 }
 
 
+INHERITED: dict[str, tuple[tuple[str, ...], str]] = {
+    "stereo": (("photographs", "stereo", "depth", "max_size"), "depth_state*.safetensors"),
+    "fit": (("fit", "seed"), "fit_state*.safetensors"),
+    "segment": (("segment", "start", "parts", "articulate.slots"), "segmentation.*"),
+    "fuse": (("fuse",), "canonical.safetensors"),
+    "articulate": (("articulate",), "articulation.safetensors"),
+}
+"""Stages that one run may take over from another: the options that decide their results beside those of the stages
+before, and their files."""
+
+
 # What the stages lean on.
 
 
@@ -606,6 +621,35 @@ def _check_same_run(folder: Path, known: dict[str, Any], wanted: dict[str, Any])
         raise HingesplatError(
             f"{folder}: belongs to another capture (the photographs in {known['capture']} have changed); {remedy}"
         )
+
+
+def _take_over(folder: Path, parents: Sequence[Path]) -> None:
+    """Copy the first stages' results from the run that agrees with this one the longest."""
+    wanted = _flat(_config_of(folder))
+    shared = {parent: _stages_shared(parent, wanted) for parent in parents}
+    best = max(shared, key=lambda parent: len(shared[parent]), default=None)
+    if best is None or not shared[best] or (folder / "stages.json").is_file():
+        return
+    for name in shared[best]:
+        for path in best.glob(INHERITED[name][1]):
+            shutil.copy2(path, folder / path.name)
+    if (best / "curves.json").is_file():
+        shutil.copy2(best / "curves.json", folder / "curves.json")
+    finished = _read_json(best / "stages.json")
+    write_json(folder / "stages.json", {name: finished[name] for name in shared[best]})
+
+
+def _stages_shared(parent: Path, wanted: dict[str, Any]) -> list[str]:
+    """The first stages of a run that the same photographs and options would make again."""
+    known = _flat(_config_of(parent))
+    finished = _read_json(parent / "stages.json") if (parent / "stages.json").is_file() else {}
+    shared = []
+    for name, (options, _) in INHERITED.items():
+        keys = [k for k in wanted if any(k == o or k.startswith(f"{o}.") for o in options)]
+        if name not in finished or any(k not in known or known[k] != wanted[k] for k in keys):
+            break
+        shared.append(name)
+    return shared
 
 
 def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
