@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from hingesplat.capture import View
-from hingesplat.gaussians import Gaussians
+from hingesplat.gaussians import Gaussians, posed
 from hingesplat.identity import Free, Identity, IdentityConfig, identity_of, parts_of_shifts
 from hingesplat.losses.part import soft_motion
 from hingesplat.optim import GaussianAdam, LearningRates
@@ -33,6 +34,9 @@ class ArticulateConfig:
     """Steps between densifications."""
     min_opacity: float = 0.02
     """Gaussians fainter than this are pruned: a wrong label fades, its neighbours fill in."""
+    frame: Literal["first", "between"] = "first"
+    """first: the canonical Gaussians are those of state 0. between: they stand anywhere between the states, and every
+    part moves from there to each state (eq. 13; paper): averaged Gaussians of parts whose motion nobody knows yet."""
     identity: IdentityConfig = field(default_factory=IdentityConfig)
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     repel: RepelConfig = field(default_factory=RepelConfig)
@@ -78,7 +82,8 @@ def articulate(
     extent = float((high - low).max())
     parts = T_state_0.shape[1]
     centres = part_centres(canonical, parts)
-    poses = PoseDelta(torch.from_numpy(T_state_0).float(), centres, extent)
+    first = config.frame == "first"
+    poses = PoseDelta(torch.from_numpy(T_state_0).float(), centres, extent, first_is_frame=first)
     pose_adam = torch.optim.Adam(poses.parameters, lr=config.pose_rate)
     rate = config.rates.means * extent
     identity = identity_of(canonical, parts, fitted, config.identity, extent, rate, generator)
@@ -101,7 +106,7 @@ def articulate(
             optimiser, R[state], t[state], view, state, config.render, extent, means=means, statistics=statistics
         )
         loss = loss + identity.loss(optimiser, p, step)
-        if state:
+        if state or not first:
             aim = targets.at(optimiser, p, R, t, state, step)
             g = optimiser.gaussians
             loss = loss + physics_loss(g, p, R[state], t[state], aim, config.physics, extent, generator)
@@ -140,6 +145,10 @@ def _result(
     if config.identity.kind != "hard":
         label, living = living_slots(g.means.numpy(), g.part.numpy(), T, extent, config.slots)
         g, T = g.with_part(torch.from_numpy(label)), T[:, living]
+    g, T = (
+        posed(g, dict(enumerate(T[0]))),
+        T @ np.linalg.inv(T[:1]),
+    )  # To state 0, where they are already if it is the frame.
     offsets = optimiser.values["state_sh"].detach().permute(1, 0, 2)
     state_sh = torch.cat([torch.zeros_like(offsets[:1]), offsets])
     return Articulation(g, T, state_sh.clone())

@@ -215,7 +215,7 @@ def measure(case: Case, capture: Path | None, home: Path, out: Path) -> Row:
     if error:
         return row | {"error": error.replace(str(capture), case.subject)}
     if not case.options:
-        _keep_picture(run / "summary.png", out / "pictures" / f"{case.name}.jpg")
+        _keep_picture(run / "summary.png", out / "summaries" / f"{case.name}.jpg")
     return row | results(run)
 
 

@@ -38,7 +38,7 @@ def _without_search(config: ReconstructConfig, method: MethodName, start: StartC
         config,
         method=method,
         start=start,
-        articulate=replace(config.articulate, pose_rate=rate),
+        articulate=replace(config.articulate, pose_rate=rate, frame="first" if method == "vanilla" else "between"),
         # The joint as a constraint on the last refinement is ours; types and standard deviations are not held back.
         joints=replace(config.joints, steps=0),
     )
@@ -59,10 +59,12 @@ def part2gs(config: ReconstructConfig) -> ReconstructConfig:
 def artgs(config: ReconstructConfig) -> ReconstructConfig:
     """ArtGS: averaged matches, parts by Mahalanobis distance to the centres of clusters; no repulsion, no physics.
 
-    Left out: its hash grid (a residual a Gaussian stands in), its depth loss, its separate run for joint types.
+    Its chamfer distance to each state's own Gaussians, weight 100, is our L_art without the angle. Left out: its hash
+    grid (a residual a Gaussian stands in), its depth loss, its separate run for joint types.
     """
     config = _without_search(config, "artgs", StartConfig(labels="clusters", motions="random", spread=0.0))
-    articulate = replace(config.articulate, identity=IdentityConfig(kind="centres"))
+    chamfer = PhysicsConfig(art=100.0, rotation=0.0, reach=1.0, every=20)
+    articulate = replace(config.articulate, identity=IdentityConfig(kind="centres"), physics=chamfer)
     return replace(config, fuse=replace(config.fuse, strategy="uniform"), articulate=articulate)
 
 

@@ -66,8 +66,12 @@ class PhysicsConfig:
     vector_reduction: Literal["mean", "sum"] = "mean"
     """sum is as printed: the weight then grows with the number of Gaussians."""
     targets: Literal["nearest", "matched"] = "nearest"
-    """μ¹ in L_art and L_vector. nearest: the state's Gaussian closest to the moved one, found anew every 200 steps.
-    matched: one to one, found once on the Gaussians where they stand (paper)."""
+    """μ¹ in L_art and L_vector. nearest: the state's Gaussian closest to the moved one. matched: one to one, found
+    once on the Gaussians where they stand (paper)."""
+    reach: float = 0.02
+    """nearest: one farther away is no target."""
+    every: int = 200
+    """nearest: steps after which they are found anew."""
     matched: int = 3000
     """matched: Gaussians of each side that are paired (Hungarian, cubic in this number)."""
 
@@ -137,10 +141,10 @@ class Targets:
         self.extra: dict[str, tuple[Tensor, float]] = {}
         if self.fitted and config.targets == "matched":
             places = torch.full((len(g), len(fitted), 3), torch.nan)
-            for state in range(1, len(fitted)):
-                rng, own = np.random.default_rng(seed), fitted[state].means
-                i, j = one_to_one(g.means.numpy(), own.numpy(), config.matched, rng)
-                places[i, state] = own[j]
+            for state, own in enumerate(fitted):
+                rng = np.random.default_rng(seed)
+                i, j = one_to_one(g.means.numpy(), own.means.numpy(), config.matched, rng)
+                places[i, state] = own.means[j]
             # A value that is never stepped: its rows follow the Gaussians when they are split and sorted.
             self.extra = {"target": (places, 0.0)}
 
@@ -150,14 +154,14 @@ class Targets:
 
     @torch.no_grad()
     def at(self, optimiser: GaussianAdam, p: Tensor | None, R: Tensor, t: Tensor, state: int, step: int) -> Aim | None:
-        """The targets of one moved state; R (states, K, 3, 3) and t (states, K, 3)."""
+        """The targets of one state; R (states, K, 3, 3) and t (states, K, 3)."""
         if not self.fitted:
             return None
         if self.extra:
             places = optimiser.values["target"].detach()[:, state]
             rows = torch.nonzero(~places[:, 0].isnan())[:, 0]
             return Aim(rows, places[rows])
-        if not self.aims or step % 200 == 0:
+        if not self.aims or step % self.config.every == 0:
             g = optimiser.gaussians
             p = one_hot(g, R.shape[1]) if p is None else p
             self.aims = [self._nearest(g, p, R[s], t[s], own) for s, own in enumerate(self.fitted)]
@@ -166,7 +170,7 @@ class Targets:
     def _nearest(self, g: Gaussians, p: Tensor, R: Tensor, t: Tensor, own: Gaussians) -> Aim:
         moved = soft_motion(g.means, p, R, t)
         distance, index = map(np.asarray, KDTree(own.means.numpy()).query(moved.numpy()))
-        rows = np.flatnonzero(distance < 0.02 * self.extent)
+        rows = np.flatnonzero(distance < self.config.reach * self.extent)
         return Aim(torch.from_numpy(rows), own.means[torch.from_numpy(index[rows])])
 
 

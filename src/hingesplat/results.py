@@ -380,7 +380,7 @@ def _side_by_side(by_method: dict[tuple, list[Row]]) -> list[str]:
 
 def _picture(page: Path, row: Row, out: Path) -> list[str]:
     """The run's small summary, copied beside the page."""
-    source = out / "pictures" / f"{row['name']}.jpg"
+    source = out / "summaries" / f"{row['name']}.jpg"
     target = page.parent / "pictures" / source.name
     if source.is_file():
         target.parent.mkdir(exist_ok=True)
@@ -458,7 +458,7 @@ class Figure:
 
     mean: float
     noise: float
-    """What two such numbers may differ by without meaning anything."""
+    """What it may be off by without meaning anything: two standard errors of ours, rounding of the paper's."""
 
     def beside(self, reference: "Figure") -> int:
         """−1 if lower than the reference, 1 if higher, 0 if the same but for noise."""
@@ -507,4 +507,4 @@ def _figure(rows: Sequence[Row], metric: str) -> Figure | None:
     values = [v for row in measured(rows) if (v := number_of(row, metric)) is not None]
     if not values:
         return None
-    return Figure(float(np.mean(values)), float(np.std(values) / np.sqrt(len(values))))
+    return Figure(float(np.mean(values)), float(2 * np.std(values) / np.sqrt(len(values))))
