@@ -94,6 +94,7 @@ PAPER = PhysicsConfig(art=1.0, contact=0.5, velocity=0.5, vector=0.5)
 OPTIONS = {
     "embedding": ArticulateConfig(identity=IdentityConfig("embedding", hard_from=0.5)),
     "embedding to the end": ArticulateConfig(identity=IdentityConfig("embedding", hard_from=0.9)),
+    "between the states": ArticulateConfig(frame="between"),
     "centres": ArticulateConfig(identity=IdentityConfig("centres", hard_from=0.9)),
     "repel": ArticulateConfig(repel=RepelConfig(points=200)),
     "repel, dynamic and noisy": ArticulateConfig(repel=RepelConfig(points=200, refresh=0.25, noise=0.01, nearest=0)),

@@ -206,7 +206,7 @@ def test_medians_beside_other_methods_are_computed(options: BenchOptions) -> Non
         case = Case("laptop", method, 0, "fast", 9, 64)
         write_json_in(options, case, found)
     text = bench(replace(options, recorded=True), ("hingesplat",), None, told).read_text()
-    assert "On 1 runs side by side, artgs's median is better in: axis ° (0.05 against 0.1)." in text
+    assert "Side by side (runs: 1), artgs's median is better in: axis ° (0.05 against 0.1)." in text
 
 
 def write_json_in(options: BenchOptions, case: Case, found: dict[str, Any]) -> None:

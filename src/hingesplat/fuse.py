@@ -25,7 +25,7 @@ class FuseConfig:
     pairs averaged with β = 1/2, a β a part, or one motion-aware β."""
     new_surface: float = 0.012
     """union: a Gaussian of state 1 is new if none of its part lies closer than this fraction of the extent."""
-    matched: int = 3000
+    matched: int = 2000
     """Gaussians of each state that are matched one to one (Hungarian, cubic in this number)."""
 
 

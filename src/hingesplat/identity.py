@@ -163,7 +163,7 @@ def identity_of(
     return Identity()
 
 
-def _matched_shift(g: Gaussians, own: Gaussians, rng: np.random.Generator, limit: int = 3000) -> Tensor:
+def _matched_shift(g: Gaussians, own: Gaussians, rng: np.random.Generator, limit: int = 2000) -> Tensor:
     """(n, 3) from each Gaussian to its match in a state's own; what has none takes its nearest neighbour's way."""
     means = g.means.numpy()
     i, j = one_to_one(means, own.means.numpy(), limit, rng)

@@ -72,7 +72,7 @@ class PhysicsConfig:
     """nearest: one farther away is no target."""
     every: int = 200
     """nearest: steps after which they are found anew."""
-    matched: int = 3000
+    matched: int = 2000
     """matched: Gaussians of each side that are paired (Hungarian, cubic in this number)."""
 
     @property

@@ -57,7 +57,7 @@ MethodName = Literal["hingesplat", "part2gs", "artgs", "vanilla"]
 
 MAX_UNEXPLAINED = 0.8
 """Share of what moved that no rigid part explains, above which there is no point in going on."""
-PLAIN_UNEXPLAINED = 0.2
+PLAIN_UNEXPLAINED = 0.15
 """Share of what moved that the given number of parts leaves unexplained, above which there must be more parts."""
 NOISE = 10
 """Seeds, in those of the smallest part, below which nothing need have moved: one state photographed twice had 167."""
@@ -298,7 +298,7 @@ def _without_redundant(run: Run, found: Segmentation, pair: tuple[Gaussians, Gau
     wanted = run.config.parts
     if wanted == "auto":
         return found
-    both = np.concatenate([posed_back(pair[1], found).means.numpy(), pair[0].means.numpy()])
+    both = np.concatenate([_posed_back(pair[1], found).means.numpy(), pair[0].means.numpy()])
     T = np.stack([np.eye(4), *(m.T for m in found.motions)])[None]
     low, high = np.quantile(both, [0.002, 0.998], axis=0)
     label = np.concatenate([found.labels[1], found.labels[0]])
@@ -311,7 +311,7 @@ def _without_redundant(run: Run, found: Segmentation, pair: tuple[Gaussians, Gau
     return replace(found, labels=(label[len(pair[1]) :], label[: len(pair[1])]), motions=motions)
 
 
-def posed_back(second: Gaussians, found: Segmentation) -> Gaussians:
+def _posed_back(second: Gaussians, found: Segmentation) -> Gaussians:
     """The last state's Gaussians brought to state 0 by the motions found."""
     labelled = second.with_part(torch.from_numpy(np.asarray(found.labels[1], np.int64)))
     return posed(labelled, {k + 1: np.linalg.inv(m.T) for k, m in enumerate(found.motions)})
@@ -445,8 +445,6 @@ STAGES: dict[str, Callable[[Run], None]] = {
     "export": _export,
     "pictures": _pictures,
 }
-
-
 INHERITED: dict[str, tuple[tuple[str, ...], str]] = {
     "stereo": (("photographs", "stereo", "depth", "max_size"), "depth_state*.safetensors"),
     "fit": (("fit", "seed"), "fit_state*.safetensors"),
@@ -537,7 +535,7 @@ def repel_points_of(folder: Path) -> np.ndarray:
     """Repel points (n, 3) as ``articulate`` draws them, where a run used them; else none."""
     told, path = _config_of(folder).get("articulate", {}).get("repel"), folder / "canonical.safetensors"
     drawn = None
-    if told and path.is_file():
+    if isinstance(told, dict) and path.is_file():
         drawn = draw_repel_points(Gaussians.load(path), RepelConfig(**told), torch.Generator().manual_seed(0))
     return np.zeros((0, 3), np.float32) if drawn is None else drawn.numpy()
 

@@ -342,7 +342,8 @@ def _section(page: Path, rows: Sequence[Row], out: Path) -> list[str]:
     by_method = grouped(rows, "method")
     text = ["Medians over all joints, parts and runs; in brackets the worst.", ""]
     text += markdown([overview(mine) for mine in by_method.values()])
-    text += ["", *_side_by_side(by_method)]
+    if beside := _side_by_side(by_method):
+        text += ["", *beside]
     for (method,), mine in by_method.items():
         lines = [cells(same) for same in grouped(mine, "subject").values()]
         text += ["", f"### {method}", "", "Axis, position and motion are those of an object's worst joint.", ""]
@@ -350,10 +351,10 @@ def _section(page: Path, rows: Sequence[Row], out: Path) -> list[str]:
     named = list(failures(rows))
     if named:
         text += ["", "### What went wrong", "", *named]
-    worst = [r for r in sorted(measured(by_method.get(("hingesplat",), [])), key=badness, reverse=True)]
+    worst = sorted(measured(by_method.get(("hingesplat",), [])), key=badness, reverse=True)
     pictures = [line for r in worst[:WORST] for line in _picture(page, r, out)]
     if pictures:
-        text += ["", "### The worst of hingesplat", "", *pictures]
+        text += ["", "### The worst of hingesplat", *pictures]
     return text
 
 
@@ -374,7 +375,7 @@ def _side_by_side(by_method: dict[tuple, list[Row]]) -> list[str]:
                 if (b > a) if metric in HIGHER_IS_BETTER else (b < a):
                     better.append(f"{title} ({b:.3g} against {a:.3g})")
         what = ", ".join(better) or "nothing"
-        text.append(f"- On {len(pairs)} runs side by side, {method}'s median is better in: {what}.")
+        text.append(f"- Side by side (runs: {len(pairs)}), {method}'s median is better in: {what}.")
     return text
 
 
@@ -389,7 +390,7 @@ def _picture(page: Path, row: Row, out: Path) -> list[str]:
         return []
     m = row["metrics"]
     told = f"{m['parts_found']} parts of {m['parts_true']}, CD-m {number_of(row, 'cd_movable') or 0:.2f}"
-    return [f"{row['subject']}, seed {row['seed']}: {told}", "", f"![{row['subject']}](pictures/{target.name})", ""]
+    return ["", f"{row['subject']}, seed {row['seed']}: {told}", "", f"![{row['subject']}](pictures/{target.name})"]
 
 
 def _paper_section(rows: Sequence[Row]) -> list[str]:
@@ -403,7 +404,9 @@ def _paper_section(rows: Sequence[Row]) -> list[str]:
                 if len({variant for _, variant in found} & {v.name for v in table.variants}) > 1:
                     title = f"### Table {number}: {table.title}" + (f"; {_base_name(table, base)}" if base else "")
                     text += ["", title, "", f"{_scale(preset, views, size)}. {table.note}".strip(), ""]
-                    text += [*markdown(table_lines(table, found)), "", *trends(table, found)]
+                    text += markdown(table_lines(table, found))
+                    if compared := trends(table, found):
+                        text += ["", *compared]
     head = (
         "In brackets the paper's figures: other objects of the same names, other pictures, 30 000 + 5 000 iterations",
         "on a GPU. Position is ten times the distance of the axes; motion is the mean over joints of degrees for",
