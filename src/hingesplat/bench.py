@@ -23,6 +23,7 @@ from hingesplat.files import whole_file, write_json
 from hingesplat.results import PAPER_OBJECTS, Row, Table, load_rows, paper_table, variant_options, write_page
 
 METHODS = ("hingesplat", "part2gs", "artgs", "vanilla")
+PRESETS = ("fast", "standard", "paper")
 TOLD_K = METHODS[1:]
 """Methods that must be told the number of parts."""
 PICTURE_SIZE = 480
@@ -148,7 +149,8 @@ def captures_in(folder: Path) -> dict[str, Path]:
 def _check(options: BenchOptions, methods: Sequence[str]) -> None:
     from hingesplat.synth.objects import NAMES
 
-    for kind, names, known in (("object", options.objects, NAMES), ("method", methods, METHODS)):
+    named = (("object", options.objects, NAMES), ("method", methods, METHODS), ("preset", [options.preset], PRESETS))
+    for kind, names, known in named:
         lost = [n for n in names if n not in known]
         if lost:
             raise HingesplatError(f"{lost[0]}: no such {kind}; there are {', '.join(known)}")
@@ -210,7 +212,7 @@ def measure(case: Case, capture: Path | None, home: Path, out: Path) -> Row:
     args += [word for k, v in told.items() for word in (f"--{k}", v)]
     parents = [str(p) for p in sorted(home.iterdir()) if (p / "stages.json").is_file() and p != run]
     args += ["--parents", *parents] if parents else []
-    error = call("reconstruct", str(capture), "--out", str(run), *args)
+    error = call("reconstruct", str(capture), "--out", str(run), "--overwrite", *args)
     error = error or call("evaluate", str(run), "--truth", str(capture))
     if error:
         return row | {"error": error.replace(str(capture), case.subject)}

@@ -426,8 +426,8 @@ def by_variant(table: Table, rows: Sequence[Row], base: str) -> dict[tuple[str, 
     known = [
         (v.name, v.method or base, variant_options(table, v.options, v.method or base)) for v, _ in table.each([base])
     ]
-    if base == "hingesplat" and table.ablates and not table.given:
-        known.append(("hingesplat as it is", base, {}))
+    if table.ablates and not table.given and all(options for _, _, options in known):
+        known.append((f"{base} as it is", base, {}))
     objects = ("all",) if table.average else table.objects
     found = {}
     for subject, (name, method, options) in product(objects, known):
