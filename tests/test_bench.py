@@ -287,6 +287,17 @@ def test_trends_are_told_apart_from_noise() -> None:
     assert trends(nine, {}) == []
 
 
+def test_no_trend_is_read_from_runs_that_failed() -> None:
+    nine = paper_table(9)
+    lost = {("table5", name): [measured(axis=a, cd=c)] for name, a, c in (("none", 70, 9), ("+ contact", 80, 90))}
+    assert trends(nine, lost) == [
+        "Like `none`, these miss the joints by more than 5°: + contact of table5.",
+        "No trend is read from them.",
+    ]
+    found = lost | {("table5", "none"): [measured()]}
+    assert any("CD-m of table5, + contact: 90 against 0.5" in line for line in trends(nine, found))
+
+
 def test_rows_whose_variants_are_methods(options: BenchOptions) -> None:
     for method in ("artgs", "part2gs", "hingesplat"):
         write_json_in(options, Case("stapler", method, 0, "fast", 9, 64), measured())

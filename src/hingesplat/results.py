@@ -473,12 +473,18 @@ class Figure:
 
 
 def trends(table: Table, found: dict[tuple[str, str], list[Row]]) -> list[str]:
-    """Where the variants do not stand to the reference as they do in the paper."""
-    same, unseen, opposite = 0, [], []
+    """Where the variants do not stand to the reference as they do in the paper.
+
+    Where both failed to find the joints, their figures say nothing.
+    """
+    same, failed, unseen, opposite = 0, [], [], []
     for (subject, name), rows in found.items():
         against = found.get((subject, table.reference), [])
         theirs = table.paper.get(subject, {})
         if name == table.reference or table.reference not in theirs or name not in theirs:
+            continue
+        if table.ablates and _lost(rows) and _lost(against):
+            failed.append(f"{name} of {subject}")
             continue
         for metric in table.metrics:
             figures = [theirs[n].get(metric) for n in (name, table.reference)]
@@ -497,13 +503,21 @@ def trends(table: Table, found: dict[tuple[str, str], list[Row]]) -> list[str]:
             else:
                 unseen.append(words)
     total = same + len(unseen) + len(opposite)
-    if not total:
-        return []
-    text = [f"Beside `{table.reference}`, {same} of {total} comparisons come out as in the paper."]
+    text = []
+    if failed:
+        text.append(f"Like `{table.reference}`, these miss the joints by more than {BAD_AXIS:g}°: {', '.join(failed)}.")
+        text.append("No trend is read from them.")
+    if total:
+        text.append(f"Beside `{table.reference}`, {same} of {total} comparisons come out as in the paper.")
     for title, words in (("The other way round:", opposite), ("A difference on one side only:", unseen)):
         if words:
             text += ["", title, "", *(f"- {w}" for w in words)]
     return text
+
+
+def _lost(rows: Sequence[Row]) -> bool:
+    axis = _figure(rows, "angle")
+    return axis is None or axis.mean > BAD_AXIS
 
 
 def _figure(rows: Sequence[Row], metric: str) -> Figure | None:
