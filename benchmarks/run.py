@@ -2,26 +2,27 @@
 
     python benchmarks/run.py [--captures DIR] [--seeds 0 1 2] [--readme README.md] [--page docs/performance.md]
 
-Writes ``benchmarks/results/*.json`` and sets the table between the marks in the README, and that of the demo's stages
-in the page. Leave the machine alone meanwhile.
+Writes ``benchmarks/results/`` and sets the table between the marks in the README, and that of the demo's stages in the
+page. Leave the machine alone meanwhile. ``hingesplat bench`` and ``hingesplat table N`` make the larger comparisons.
 """
 
 import tempfile
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import stages
 import tyro
-from captures import Options as CaptureOptions
-from captures import by_capture, call, cells, measure_all, results
-from common import machine, recorded, save, set_between
+from common import RESULTS, machine, recorded, save, set_between
 from rich.console import Console
 
-LEFT_OUT = ("fit s", "segment s", "joint s", "rest s")
-"""Columns of ``captures.cells`` that the README does without."""
+from hingesplat.bench import BenchOptions, Case, bench, call, results
+from hingesplat.files import write_json
+from hingesplat.results import Row, cells, grouped, load_rows, markdown
+
+RESULTS_PAGE = RESULTS.parent.parent / "docs" / "results.md"
+LEFT_OUT = ("penetration", "fit s", "segment s", "joint s", "rest s")
+"""Columns of ``cells`` that the README does without."""
 
 
 @dataclass(frozen=True)
@@ -39,48 +40,50 @@ class Options:
     """Measure nothing: set the table from what ``benchmarks/results/`` holds."""
 
 
-def demo() -> dict[str, Any]:
+def demo() -> None:
     """The demo twice, in processes of their own: the second run has everything compiled, and is what is told."""
+    case = Case("demo", "hingesplat", 0, "standard", None, None)
+    row: Row = dict(case.key)
     with tempfile.TemporaryDirectory(prefix="hingesplat-demo-") as folder:
         for _ in range(2):
             started = time.perf_counter()
             error = call("demo", "--out", folder)
-            row: dict[str, Any] = {"capture": "demo", "wall_seconds": round(time.perf_counter() - started, 1)}
+            seconds = round(time.perf_counter() - started, 1)
         if error:
-            return row | {"error": error}
-        run = Path(folder) / "run"
-        save("stages", {"machine": machine(), **stages.stages_of(run), "wall_seconds": row["wall_seconds"]})
-        return row | results(run)
+            row |= {"error": error}
+        else:
+            run = Path(folder) / "run"
+            save("stages", {"machine": machine(), **stages.stages_of(run), "wall_seconds": seconds})
+            row |= results(run)
+    write_json(RESULTS / "runs" / f"{case.name}.json", row)
 
 
-def markdown(rows: Sequence[dict[str, Any]]) -> str:
+def readme_table(rows: list[Row]) -> str:
     """The table for the README with what stands around it."""
-    groups = by_capture(rows)
-    lines = [cells(group) for group in groups]
-    head = [title for title in max(lines, key=len) if title not in LEFT_OUT]
-    table = ["| " + " | ".join([*head, "given"]) + " |", "|---" * (len(head) + 1) + "|"]
-    for line, group in zip(lines, groups, strict=True):
-        given = next((r["summary"]["given"] for r in group if "summary" in r), None)
-        told = "" if given is None else ", ".join(k for k, v in given.items() if v) or "nothing"
-        table.append("| " + " | ".join([*(line.get(title, "") for title in head), told]) + " |")
-    seeds = sorted({r["summary"]["seed"] for r in rows if "summary" in r})
+    lines = markdown([cells(group) for group in grouped(rows, "subject").values()], LEFT_OUT)
+    seeds = sorted({r["seed"] for r in rows})
     notes = (
-        "Axis, position and motion are those of a capture's worst joint; one that was not found counts 90°.",
+        "Axis, position and motion are those of an object's worst joint; one that was not found counts 90°.",
         f"Seeds: {', '.join(map(str, seeds)) or '–'}; ± is the standard deviation over them.",
         f"Machine: {machine()}.",
     )
-    return "\n".join([*table, "", *notes])
+    return "\n".join([*lines, "", *notes])
 
 
 def main() -> None:
     options = tyro.cli(Options, description=__doc__)
     console = Console()
     if not options.recorded:
-        save("demo", [demo()])
+        demo()
         if options.captures is not None:
-            save("captures", measure_all(CaptureOptions(options.captures, seeds=options.seeds), console))
-    rows = [row for name in ("demo", "captures") for row in recorded(name) or []]
-    table = markdown(rows)
+            bench(
+                BenchOptions(seeds=options.seeds, out=RESULTS, page=RESULTS_PAGE),
+                ("hingesplat",),
+                options.captures,
+                lambda line: console.print(line, soft_wrap=True, markup=False),
+            )
+    rows = [r for r in load_rows(RESULTS) if r["method"] == "hingesplat" and r["views"] is None and not r["options"]]
+    table = readme_table(sorted(rows, key=lambda r: r["subject"] != "demo"))
     console.print(table, soft_wrap=True, markup=False)
     if options.readme is not None:
         set_between(options.readme, "results", table)

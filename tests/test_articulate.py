@@ -7,6 +7,8 @@ import pytest
 import torch
 
 from hingesplat.articulate import ArticulateConfig, Articulation, articulate
+from hingesplat.identity import IdentityConfig
+from hingesplat.physics import PhysicsConfig, RepelConfig
 from hingesplat.screw import prismatic, revolute
 from scenes import (
     PIVOT,
@@ -88,24 +90,22 @@ def test_light_that_changes_between_states_is_learnt() -> None:
     assert distance(found.T_state_0, made) < 0.005
 
 
+PAPER = PhysicsConfig(art=1.0, contact=0.5, velocity=0.5, vector=0.5)
 OPTIONS = {
-    "embedding": ArticulateConfig(identity="embedding", hard_from=0.5),
-    "embedding to the end": ArticulateConfig(identity="embedding", hard_from=0.9),
-    "repel": ArticulateConfig(repel=True, repel_points=200),
-    "art": ArticulateConfig(art_weight=1.0),
-    "contact": ArticulateConfig(contact_weight=0.5),
-    "velocity twist": ArticulateConfig(velocity_weight=0.5),
-    "velocity as printed": ArticulateConfig(velocity_weight=0.5, velocity_form="displacement"),
-    "vector": ArticulateConfig(vector_weight=0.5),
-    "everything": ArticulateConfig(
-        identity="embedding",
-        hard_from=0.7,
-        repel=True,
-        art_weight=1.0,
-        contact_weight=0.5,
-        velocity_weight=0.5,
-        vector_weight=0.5,
-    ),
+    "embedding": ArticulateConfig(identity=IdentityConfig("embedding", hard_from=0.5)),
+    "embedding to the end": ArticulateConfig(identity=IdentityConfig("embedding", hard_from=0.9)),
+    "between the states": ArticulateConfig(frame="between"),
+    "centres": ArticulateConfig(identity=IdentityConfig("centres", hard_from=0.9)),
+    "repel": ArticulateConfig(repel=RepelConfig(points=200)),
+    "repel, dynamic and noisy": ArticulateConfig(repel=RepelConfig(points=200, refresh=0.25, noise=0.01, nearest=0)),
+    "art": ArticulateConfig(physics=PhysicsConfig(art=1.0)),
+    "art, matched": ArticulateConfig(physics=PhysicsConfig(art=1.0, targets="matched")),
+    "contact": ArticulateConfig(physics=PhysicsConfig(contact=0.5)),
+    "velocity twist": ArticulateConfig(physics=PhysicsConfig(velocity=0.5)),
+    "velocity as printed": ArticulateConfig(physics=PhysicsConfig(velocity=0.5, velocity_form="displacement")),
+    "vector": ArticulateConfig(physics=PhysicsConfig(vector=0.5)),
+    "vector as printed": ArticulateConfig(physics=PhysicsConfig(vector=0.5, vector_reduction="sum")),
+    "everything": ArticulateConfig(identity=IdentityConfig("embedding"), repel=RepelConfig(points=2000), physics=PAPER),
 }
 
 
@@ -123,10 +123,13 @@ def test_every_term_runs_and_labels_are_hard_at_the_end(name: str) -> None:
     assert distance(found.T_state_0, made) < 1.2 * distance(off_by(made, 2.0), made)
 
 
-def test_targets_follow_their_gaussians_through_densification() -> None:
+@pytest.mark.parametrize("targets", ["nearest", "matched"])
+def test_targets_follow_their_gaussians_through_densification(targets) -> None:
     """L_art and L_vector pull to the other state's Gaussians: rows that changed places must not pull elsewhere."""
     made = scene("revolute", 48, 0.08)
-    config = ArticulateConfig(steps=40, densify_every=5, art_weight=1.0, vector_weight=1.0, pose_rate=2e-3)
+    config = ArticulateConfig(
+        steps=40, densify_every=5, physics=PhysicsConfig(art=1.0, vector=1.0, targets=targets), pose_rate=2e-3
+    )
     found, losses = run(made, config, degrees=0.0)
     assert distance(found.T_state_0, made) < 0.01
     assert losses[-1] < 0.2
@@ -146,7 +149,9 @@ def test_a_wrong_soft_label_is_corrected() -> None:
     slab = torch.nonzero(made.gaussians.part == 1)[:, 0]
     part = made.gaussians.part.clone()
     part[slab[::10]] = 0
-    config = ArticulateConfig(steps=150, identity="embedding", part_weight=5.0, hard_from=0.9, densify_every=1000)
+    config = ArticulateConfig(
+        steps=150, identity=IdentityConfig("embedding", weight=5.0, hard_from=0.9), densify_every=1000
+    )
     found = articulate(made.gaussians.with_part(part), made.T_state_0, made.views, config)
     wrong_before = int((part != made.gaussians.part).sum())
     known = torch.cdist(found.gaussians.means, made.gaussians.means).argmin(1)

@@ -180,7 +180,7 @@ def test_a_photograph_sets_the_state_and_stands_beside_its_render(run: Path, mad
 
 
 def test_repel_points_are_shown_where_the_run_had_some(run: Path) -> None:
-    (run / "config.json").write_text(json.dumps({"articulate": {"repel": True, "repel_points": 50}}))
+    (run / "config.json").write_text(json.dumps({"articulate": {"repel": {"points": 50}}}))
     blocks().save(run / "canonical.safetensors")
     from hingesplat.pipeline import repel_points_of
 

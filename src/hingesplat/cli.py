@@ -23,6 +23,7 @@ from rich.table import Table
 from rich.text import Text
 
 import hingesplat
+from hingesplat.bench import METHODS, BenchOptions, bench, bench_table
 from hingesplat.errors import HingesplatError
 from hingesplat.export import FORMATS, ExportConfig, export_twin
 
@@ -49,6 +50,8 @@ class Reconstruct:
     """Folder of masks (MASKS/STATE/IMAGE.png), where the images have none."""
     overwrite: bool = False
     """Start afresh where the run folder holds another run."""
+    parents: tuple[Path, ...] = ()
+    """Other runs of this capture: a new run takes over their first stages as far as the options agree."""
     quiet: bool = False
     """Say nothing but warnings and errors."""
     config: tyro.conf.Suppress[Any] = None  # A ReconstructConfig; ``parse_reconstruct`` makes options of it.
@@ -62,7 +65,7 @@ class Reconstruct:
 
         config = self.config
         capture = load_capture(self.capture, max_size=config.max_size, masks=self.masks, with_depth=config.depth)
-        twin = _reconstruct(capture, config, self.out, self.overwrite, console)
+        twin = _reconstruct(capture, config, self.out, self.overwrite, console, self.parents)
         show_joints(console, twin)
         show_paths(console, self.out)
 
@@ -280,7 +283,56 @@ def demo_config() -> "ReconstructConfig":
     )
 
 
-Command = Reconstruct | View | Render | Report | Export | Evaluate | Synth | Demo
+@dataclass(frozen=True)
+class Bench:
+    """Reconstruct and measure methods × objects × seeds, and make the page of results; what is there is kept."""
+
+    methods: tuple[str, ...] = METHODS
+    """hingesplat, part2gs, artgs, vanilla; the last three are told the number of parts."""
+    captures: Path | None = None
+    """Folder of captures with truth/ inside, to be measured instead of made objects, or beside those of --objects."""
+    options: Annotated[BenchOptions, tyro.conf.arg(name="")] = field(default_factory=BenchOptions)
+    quiet: bool = False
+    """Say nothing but warnings and errors."""
+
+    def run(self, console: Console) -> None:
+        page = bench(self.options, self.methods, self.captures, _saying(console))
+        console.print(f"written: {escape(str(page))}", soft_wrap=True)
+
+
+@dataclass(frozen=True)
+class TableCommand:
+    """Make one of the paper's supplementary tables, 4 to 15, on made objects of the same names, at our scale."""
+
+    number: Annotated[tyro.conf.Positional[int], tyro.conf.arg(metavar="N")]
+    """Of the table."""
+    methods: tuple[str, ...] = ("part2gs", "hingesplat")
+    """What the table's variants are variants of, where its rows are not methods themselves."""
+    options: Annotated[BenchOptions, tyro.conf.arg(name="")] = field(default_factory=BenchOptions)
+    quiet: bool = False
+    """Say nothing but warnings and errors."""
+
+    def run(self, console: Console) -> None:
+        page = bench_table(self.number, self.options, self.methods, _saying(console))
+        console.print(f"written: {escape(str(page))}", soft_wrap=True)
+
+
+def _saying(console: Console) -> Callable[[str], None]:
+    return lambda line: console.print(escape(line), soft_wrap=True)
+
+
+Command = (
+    Reconstruct
+    | View
+    | Render
+    | Report
+    | Export
+    | Evaluate
+    | Synth
+    | Demo
+    | Bench
+    | Annotated[TableCommand, tyro.conf.subcommand("table")]
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -315,8 +367,9 @@ def parse(args: list[str]) -> Command:
 
 
 def parse_reconstruct(args: list[str]) -> Reconstruct:
-    """The options of ``reconstruct`` with those of every stage; their defaults are the preset's."""
-    from hingesplat.pipeline import ReconstructConfig, preset
+    """The options of ``reconstruct`` with those of every stage; their defaults are the preset's and the method's."""
+    from hingesplat.methods import configure
+    from hingesplat.pipeline import ReconstructConfig
 
     def parsed(default: ReconstructConfig) -> Any:
         nested: Any = Annotated[ReconstructConfig, tyro.conf.arg(name="")]
@@ -326,15 +379,17 @@ def parse_reconstruct(args: list[str]) -> Reconstruct:
         return tyro.cli(full, args=args, prog=prog, description=Reconstruct.__doc__, config=FLAGS)
 
     command = parsed(ReconstructConfig())
-    named = command.config.preset
-    return command if named == "standard" else parsed(preset(named))
+    default = configure(command.config.method, command.config.preset)
+    return command if default == ReconstructConfig() else parsed(default)
 
 
-def _reconstruct(capture: Any, config: Any, out: Path, overwrite: bool, console: Console) -> "Twin":
+def _reconstruct(
+    capture: Any, config: Any, out: Path, overwrite: bool, console: Console, parents: Sequence[Path] = ()
+) -> "Twin":
     from hingesplat.pipeline import reconstruct
 
     with StageProgress(console) as report:
-        return reconstruct(capture, config, out=out, overwrite=overwrite, report=report)
+        return reconstruct(capture, config, out=out, overwrite=overwrite, parents=parents, report=report)
 
 
 class _Remaining(ProgressColumn):

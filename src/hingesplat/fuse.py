@@ -10,11 +10,10 @@ from typing import Literal
 
 import numpy as np
 import torch
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
-from scipy.spatial.distance import cdist
 
 from hingesplat.gaussians import Gaussians, concatenate, posed
+from hingesplat.matching import one_to_one
 
 
 @dataclass(frozen=True)
@@ -26,7 +25,7 @@ class FuseConfig:
     pairs averaged with β = 1/2, a β a part, or one motion-aware β."""
     new_surface: float = 0.012
     """union: a Gaussian of state 1 is new if none of its part lies closer than this fraction of the extent."""
-    matched: int = 5000
+    matched: int = 2000
     """Gaussians of each state that are matched one to one (Hungarian, cubic in this number)."""
 
 
@@ -85,13 +84,9 @@ def _new_surface(first: Gaussians, back: Gaussians, radius: float) -> torch.Tens
 
 
 def _matched_average(first: Gaussians, second: Gaussians, back: Gaussians, config: FuseConfig, seed: int) -> Gaussians:
-    rng = np.random.default_rng(seed)
-    rows0 = rng.permutation(len(first))[: config.matched]
-    rows1 = rng.permutation(len(second))[: config.matched]
-    cost = cdist(first.means[rows0].numpy(), back.means[rows1].numpy())
-    i, j = linear_sum_assignment(cost)
-    same = (first.part[rows0[i]] == back.part[rows1[j]]).numpy()
-    i, j = torch.from_numpy(rows0[i[same]]), torch.from_numpy(rows1[j[same]])
+    i, j = one_to_one(first.means.numpy(), back.means.numpy(), config.matched, np.random.default_rng(seed))
+    same = (first.part[i] == back.part[j]).numpy()
+    i, j = torch.from_numpy(i[same]), torch.from_numpy(j[same])
     beta = torch.full((int(first.part.max()) + 1,), 0.5)
     if config.strategy == "global":
         beta[:] = fusion_weight(first.means.numpy(), second.means.numpy())

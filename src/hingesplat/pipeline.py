@@ -28,7 +28,7 @@ import trimesh
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from hingesplat.articulate import ArticulateConfig, Articulation, articulate, draw_repel_points
+from hingesplat.articulate import ArticulateConfig, Articulation, articulate
 from hingesplat.camera import common_up
 from hingesplat.capture import Capture, View, load_cameras
 from hingesplat.capture.images import downsampled
@@ -41,10 +41,13 @@ from hingesplat.fuse import FuseConfig, fuse
 from hingesplat.gaussians import Gaussians, posed
 from hingesplat.joints import JointsConfig, find_joints
 from hingesplat.mesh import MeshConfig, mesh_parts
+from hingesplat.physics import RepelConfig, draw_repel_points
 from hingesplat.pictures import movable_share, write_motion_gif, write_summary
 from hingesplat.report import spread_views, write_report, write_views
 from hingesplat.search import Motion
 from hingesplat.segment import Segmentation, SegmentConfig, segment, track
+from hingesplat.slots import living_slots
+from hingesplat.start import StartConfig, clusters, random_motions
 from hingesplat.stereo import DepthMap, StereoConfig, depth_map, measured, stereo
 from hingesplat.twin import Joint, Part, Twin
 
@@ -52,9 +55,12 @@ log = logging.getLogger(__name__)
 
 Report = Callable[..., None]
 PresetName = Literal["fast", "standard", "paper"]
+MethodName = Literal["hingesplat", "part2gs", "artgs", "vanilla"]
 
 MAX_UNEXPLAINED = 0.8
 """Share of what moved that no rigid part explains, above which there is no point in going on."""
+PLAIN_UNEXPLAINED = 0.15
+"""Share of what moved that the given number of parts leaves unexplained, above which there must be more parts."""
 NOISE = 10
 """Seeds, in those of the smallest part, below which nothing need have moved: one state photographed twice had 167."""
 SHOWN_VIEWS = 3
@@ -73,8 +79,11 @@ class ReconstructConfig:
 
     preset: PresetName = "standard"
     """Where the numbers of the stages come from: about half the steps, ours, or the paper's."""
+    method: MethodName = "hingesplat"
+    """Where the switches of the stages come from: ours, or a method of the literature (docs/method.md), which needs
+    ``parts``."""
     parts: Literal["auto"] | int = "auto"
-    """Number of rigid parts with the base, as ``twin.json`` lists them; ``auto`` finds it."""
+    """Number of rigid parts with the base, an upper bound: redundant ones die. ``auto`` finds it."""
     seed: int = 0
     """Of every random choice; the same seed on the same machine gives the same joints."""
     max_size: int | None = None
@@ -84,6 +93,7 @@ class ReconstructConfig:
     stereo: StereoConfig = field(default_factory=StereoConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     segment: SegmentConfig = field(default_factory=SegmentConfig)
+    start: StartConfig = field(default_factory=StartConfig)
     fuse: FuseConfig = field(default_factory=FuseConfig)
     articulate: ArticulateConfig = field(default_factory=ArticulateConfig)
     joints: JointsConfig = field(default_factory=JointsConfig)
@@ -172,6 +182,7 @@ def reconstruct(
     *,
     out: Path | None = None,
     overwrite: bool = False,
+    parents: Sequence[Path] = (),
     report: Report = lambda **_: None,
 ) -> Twin:
     """Photographs of an object in two or more states to a twin of it that moves.
@@ -182,6 +193,8 @@ def reconstruct(
         out: the run folder, made if absent; a run of the same capture and config goes on after its last
             finished stage. A new temporary folder, named in the log, if None.
         overwrite: start afresh where ``out`` holds another run.
+        parents: run folders of the same capture; a new run takes over the first stages of the one whose config
+            agrees with its own the longest, times and all.
         report: called with ``stage`` when a stage begins, with ``stage, seconds`` when it ends, and between
             with ``stage, step, steps, loss, psnr, gaussians`` (and ``state`` while fitting).
 
@@ -197,6 +210,7 @@ def reconstruct(
     capture = _capped(capture, config.max_size)
     folder = Path(tempfile.mkdtemp(prefix="hingesplat-")) if out is None else Path(out)
     _open(folder, capture, config, overwrite)
+    _take_over(folder, parents)
     curves = Curves(folder / "curves.json", report)
     run = Run(folder, capture, config, curves.report)
     try:
@@ -275,21 +289,60 @@ def _segment(run: Run) -> None:
     """Parts from the first and the last state: the farther the motion, the plainer."""
     last = len(run.capture.states) - 1
     pair = (_fitted(run, 0), _fitted(run, last))
+    if run.config.start.labels != "search":
+        return _start_without_search(run, pair)
     parts = None if run.config.parts == "auto" else run.config.parts - 1
     views, maps = (run.views[0], run.views[last]), (_depth(run, 0), _depth(run, last))
     found = segment(pair, views, run.config.segment, maps=maps, parts=parts, seed=run.config.seed)
     _check_explained(run, found, last)
-    write_tensors(
-        run / "segmentation.safetensors",
-        {
-            "labels_0": torch.from_numpy(np.asarray(found.labels[0], np.int64)),
-            "labels_1": torch.from_numpy(np.asarray(found.labels[1], np.int64)),
-            "T_1_0": torch.from_numpy(np.stack([np.eye(4), *(m.T for m in found.motions)])),
-        },
-    )
+    found = _without_redundant(run, found, pair)
+    T_1_0 = np.stack([np.eye(4), *(m.T for m in found.motions)])
+    if run.config.start.motions == "random":
+        T_1_0 = random_motions(len(T_1_0), pair[0].means.numpy(), run.config.start.spread, run.config.seed)
+    _write_start(run, found.labels, T_1_0)
     motions = [{k: np.asarray(v).tolist() for k, v in asdict(m).items()} for m in found.motions]
     known = {"states": [0, last], "seeds": found.seeds, "unexplained": found.unexplained, "motions": motions}
     write_json(run / "segmentation.json", known)
+
+
+def _start_without_search(run: Run, pair: tuple[Gaussians, Gaussians]) -> None:
+    """Clusters or no labels at all, and random motions, for as many parts as were asked for."""
+    config, parts = run.config.start, run.config.parts
+    assert parts != "auto"
+    labels = (np.zeros(len(pair[0]), int), np.zeros(len(pair[1]), int))
+    if config.labels == "clusters":
+        labels = clusters(pair, parts, config, run.config.seed)
+    _write_start(run, labels, random_motions(parts, pair[0].means.numpy(), config.spread, run.config.seed))
+    write_json(run / "segmentation.json", {"states": [0, len(run.capture.states) - 1], "motions": []})
+
+
+def _without_redundant(run: Run, found: Segmentation, pair: tuple[Gaussians, Gaussians]) -> Segmentation:
+    """A number of parts that was given is an upper bound: what is left over dies, and what is missing is said."""
+    wanted = run.config.parts
+    if wanted == "auto":
+        return found
+    both = np.concatenate([_posed_back(pair[1], found).means.numpy(), pair[0].means.numpy()])
+    T = np.stack([np.eye(4), *(m.T for m in found.motions)])[None]
+    low, high = np.quantile(both, [0.002, 0.998], axis=0)
+    label = np.concatenate([found.labels[1], found.labels[0]])
+    label, living = living_slots(both, label, T, float((high - low).max()), run.config.articulate.slots)
+    if len(living) < wanted:
+        log.warning("parts: %d given, but only %d are seen", wanted, len(living))
+    if found.unexplained > PLAIN_UNEXPLAINED:
+        log.warning("parts: %d given, but %.0f%% of what moved needs more", wanted, 100 * found.unexplained)
+    motions = tuple(found.motions[k - 1] for k in living[1:])
+    return replace(found, labels=(label[len(pair[1]) :], label[: len(pair[1])]), motions=motions)
+
+
+def _posed_back(second: Gaussians, found: Segmentation) -> Gaussians:
+    """The last state's Gaussians brought to state 0 by the motions found."""
+    labelled = second.with_part(torch.from_numpy(np.asarray(found.labels[1], np.int64)))
+    return posed(labelled, {k + 1: np.linalg.inv(m.T) for k, m in enumerate(found.motions)})
+
+
+def _write_start(run: Run, labels: tuple[np.ndarray, np.ndarray], T_1_0: np.ndarray) -> None:
+    found = {f"labels_{s}": torch.from_numpy(np.asarray(labels[s], np.int64)) for s in (0, 1)}
+    write_tensors(run / "segmentation.safetensors", found | {"T_1_0": torch.from_numpy(T_1_0)})
 
 
 def _fuse(run: Run) -> None:
@@ -323,7 +376,8 @@ def _articulate(run: Run) -> None:
     if len(T_1_0) > 1:
         labels = load_file(run / "segmentation.safetensors")["labels_0"].numpy()
         motions = [Motion.of(m) for m in _read_json(run / "segmentation.json")["motions"]]
-        for t in range(1, len(T_state_0) - 1):
+        # A start without motions leaves the states between to the optimisation.
+        for t in range(1, len(T_state_0) - 1 if motions else 1):
             pair, views = (fitted[0], fitted[t]), (run.views[0], run.views[t])
             maps = (_depth(run, 0), _depth(run, t))
             T_state_0[t, 1:] = track(pair, views, labels, motions, run.config.segment, maps=maps, seed=run.config.seed)
@@ -414,6 +468,15 @@ STAGES: dict[str, Callable[[Run], None]] = {
     "export": _export,
     "pictures": _pictures,
 }
+INHERITED: dict[str, tuple[tuple[str, ...], str]] = {
+    "stereo": (("photographs", "stereo", "depth", "max_size"), "depth_state*.safetensors"),
+    "fit": (("fit", "seed"), "fit_state*.safetensors"),
+    "segment": (("segment", "start", "parts", "articulate.slots"), "segmentation.*"),
+    "fuse": (("fuse",), "canonical.safetensors"),
+    "articulate": (("articulate",), "articulation.safetensors"),
+}
+"""Stages that one run may take over from another: the options that decide their results beside those of the stages
+before, and their files."""
 
 
 # What the stages lean on.
@@ -433,6 +496,10 @@ def _check(config: ReconstructConfig) -> None:
         raise HingesplatError(f"parts: must be auto, or at least 2 (the base and a mover), not {config.parts}")
     if config.max_size is not None and config.max_size < 1:
         raise HingesplatError(f"max_size: must be at least 1 pixel, not {config.max_size}")
+    if config.start.labels != "search" and config.parts == "auto":
+        raise HingesplatError(f"parts: method {config.method} does not find it; give --parts N, the base included")
+    if config.start.labels != "search" and config.start.motions == "search":
+        raise HingesplatError(f"start.motions: {config.start.labels} labels come without; give random")
 
 
 def _check_explained(run: Run, found: Segmentation, last: int) -> None:
@@ -489,11 +556,10 @@ def up_of(folder: Path) -> np.ndarray | None:
 
 def repel_points_of(folder: Path) -> np.ndarray:
     """Repel points (n, 3) as ``articulate`` draws them, where a run used them; else none."""
-    told, path = _config_of(folder).get("articulate", {}), folder / "canonical.safetensors"
+    told, path = _config_of(folder).get("articulate", {}).get("repel"), folder / "canonical.safetensors"
     drawn = None
-    if told.get("repel") and path.is_file():
-        config = ArticulateConfig(repel=True, repel_points=told["repel_points"])
-        drawn = draw_repel_points(Gaussians.load(path), config, torch.Generator().manual_seed(0))
+    if isinstance(told, dict) and path.is_file():
+        drawn = draw_repel_points(Gaussians.load(path), RepelConfig(**told), torch.Generator().manual_seed(0))
     return np.zeros((0, 3), np.float32) if drawn is None else drawn.numpy()
 
 
@@ -578,6 +644,35 @@ def _check_same_run(folder: Path, known: dict[str, Any], wanted: dict[str, Any])
         )
 
 
+def _take_over(folder: Path, parents: Sequence[Path]) -> None:
+    """Copy the first stages' results from the run that agrees with this one the longest."""
+    wanted = _flat(_config_of(folder))
+    shared = {parent: _stages_shared(parent, wanted) for parent in parents}
+    best = max(shared, key=lambda parent: len(shared[parent]), default=None)
+    if best is None or not shared[best] or (folder / "stages.json").is_file():
+        return
+    for name in shared[best]:
+        for path in best.glob(INHERITED[name][1]):
+            shutil.copy2(path, folder / path.name)
+    if (best / "curves.json").is_file():
+        shutil.copy2(best / "curves.json", folder / "curves.json")
+    finished = _read_json(best / "stages.json")
+    write_json(folder / "stages.json", {name: finished[name] for name in shared[best]})
+
+
+def _stages_shared(parent: Path, wanted: dict[str, Any]) -> list[str]:
+    """The first stages of a run that the same photographs and options would make again."""
+    known = _flat(_config_of(parent))
+    finished = _read_json(parent / "stages.json") if (parent / "stages.json").is_file() else {}
+    shared = []
+    for name, (options, _) in INHERITED.items():
+        keys = [k for k in wanted if any(k == o or k.startswith(f"{o}.") for o in options)]
+        if name not in finished or any(k not in known or known[k] != wanted[k] for k in keys):
+            break
+        shared.append(name)
+    return shared
+
+
 def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested keys joined by dots."""
     flat = {}
@@ -608,6 +703,7 @@ def _write_summary(run: Run, finished: dict[str, Any]) -> None:
         "peak_memory_mb": max((p for p in peaks if p is not None), default=None),
         "given": {"parts": run.config.parts != "auto", "types": False, "depth": run.config.depth},
         "preset": run.config.preset,
+        "method": run.config.method,
         "seed": run.config.seed,
         "device": device,
         "backend": "gsplat" if device == "cuda" else "numba",

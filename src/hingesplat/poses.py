@@ -19,12 +19,16 @@ class PoseDelta:
     Adam sees radians and extents, so that one step size serves both.
     """
 
-    def __init__(self, T_state_0: Tensor, centres: Tensor, extent: float) -> None:
-        """``T_state_0`` (states, parts, 4, 4) start; ``centres`` (parts, 3) in the frame of state 0."""
+    def __init__(self, T_state_0: Tensor, centres: Tensor, extent: float, *, first_is_frame: bool = True) -> None:
+        """``T_state_0`` (states, parts, 4, 4) start; ``centres`` (parts, 3) in the frame of state 0.
+
+        If not ``first_is_frame``, the Gaussians stand between the states, and parts move to state 0, too.
+        """
         self.start, self.extent = T_state_0, extent
         self.pivots = (T_state_0[..., :3, :3] @ centres[..., None])[..., 0] + T_state_0[..., :3, 3]
         free = T_state_0.new_ones(T_state_0.shape[:2])
-        free[0], free[:, 0] = 0, 0  # State 0 is the frame, and the base does not move.
+        free[:, 0] = 0  # The base does not move.
+        free[0] *= not first_is_frame
         self.free = free[..., None]
         self.turn = torch.zeros_like(self.pivots, requires_grad=True)
         self.shift = torch.zeros_like(self.pivots, requires_grad=True)
