@@ -652,23 +652,52 @@ def test_every_format_is_written_and_moves_as_a_folder(cabinet: Made, tmp_path: 
     assert not list(tmp_path.rglob("*.tmp*"))
 
 
-def test_parts_that_touched_in_a_photographed_state_may_touch(tmp_path: Path) -> None:
-    """Two drawers side by side, one opening while the other closes: their meshes meet in state 1 only."""
+def drawers(gap: float, reach: tuple[float, float], states: tuple[float, float]) -> Made:
+    """Two drawers with wide fronts, one above the other's way: they slide towards each other."""
     meshes = {
         0: box((1, 0.2, 0.2), (0, 0.5, 0), (180, 140, 100)),
-        1: box((0.2, 0.2, 0.2), (-0.2, 0, 0), (200, 40, 40)),
-        2: box((0.2, 0.2, 0.2), (0.2, 0, 0), (40, 40, 200)),
+        1: box((0.2, 0.2, 0.2), (-0.1 - gap / 2, 0, 0), (200, 40, 40)),
+        2: box((0.2, 0.2, 0.2), (0.1 + gap / 2, 0, 0), (40, 40, 200)),
     }
     joints = tuple(
-        Joint(i, 0, "prismatic", (x, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, far), (0.0, far))
-        for i, x, far in ((1, 1.0, 0.1), (2, -1.0, 0.1))
+        Joint(i, 0, "prismatic", (x, 0.0, 0.0), (0.0, 0.0, 0.0), states, reach) for i, x in ((1, 1.0), (2, -1.0))
     )
-    twin = Twin(tuple(Part(i, f"p{i}", 5) for i in range(3)), joints)
-    for scale in (1.0, 2.5):
-        links = build_links(twin, meshes, ExportConfig(scale=scale), tmp_path)
-        np.testing.assert_allclose(links[1].pose(1)[:3, 3], [0.1 * scale, 0, 0], atol=1e-12)
-        pairs = {frozenset((a.name, b.name)) for a, b in touching(links)}
-        assert frozenset(("p1", "p2")) in pairs
-    apart = replace(twin, joints=tuple(replace(j, states=(0.0, 0.02)) for j in joints))
-    links = build_links(apart, meshes, ExportConfig(), tmp_path)
-    assert frozenset(("p1", "p2")) not in {frozenset((a.name, b.name)) for a, b in touching(links)}
+    return Twin(tuple(Part(i, f"p{i}", 5) for i in range(3)), joints), meshes
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.5])
+@pytest.mark.parametrize(
+    ("reach", "states", "meet"),
+    [
+        ((0.0, 0.2), (0.0, 0.1), True),  # In a photographed state.
+        ((0.0, 0.2), (0.0, 0.02), True),  # Beyond both, where the limits let them go.
+        ((0.0, 0.05), (0.0, 0.02), False),
+    ],
+)
+def test_parts_whose_ways_cross_pass_through_each_other(
+    tmp_path: Path, scale: float, reach, states, meet: bool
+) -> None:
+    links = build_links(*drawers(0.2, reach, states), ExportConfig(scale=scale), tmp_path)
+    pose = links[1].pose(lambda link: link.joint.states[1] if link.joint else 0.0)
+    np.testing.assert_allclose(pose[:3, 3], [states[1] * scale, 0, 0], atol=1e-12)
+    pairs = {frozenset((a.name, b.name)) for a, b in touching(links)}
+    assert (frozenset(("p1", "p2")) in pairs) == meet
+    assert {frozenset(("base", "p1")), frozenset(("base", "p2"))} <= pairs
+
+
+def test_parts_that_pass_through_each_other_are_named_by_the_check(tmp_path: Path, capfd) -> None:
+    pytest.importorskip("mujoco")
+    # The one's way crosses where the other rests: with contacts it would be stopped at half of its range.
+    made = drawers(0.1, (0.0, 0.2), (0.0, 0.05))
+    path = export(made, tmp_path, "mjcf", tmp_path)
+    (check,) = check_export("mjcf", path)
+    assert check.ok and check.contacts == () and check.ignored == ("p1 and p2",)
+    cli.show_check(cli.Console(), "mjcf", check)
+    assert "may pass through each other, as their meshes meet: p1 and p2" in " ".join(capfd.readouterr().out.split())
+    root = etree.parse(path)
+    for exclude in root.findall("contact/exclude"):
+        if exclude.get("body2") == "p2" and exclude.get("body1") == "p1":
+            exclude.getparent().remove(exclude)
+    root.write(path)
+    (check,) = check_export("mjcf", path)
+    assert not check.ok and check.error_percent > 10 and check.contacts == ("p1 and p2",)

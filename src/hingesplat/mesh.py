@@ -6,6 +6,7 @@ part in the part's own frame. What no view ever saw is solid behind the surfaces
 and farther in where these close around it.
 """
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -25,6 +26,8 @@ from hingesplat.render import rasterize
 from hingesplat.se3 import wxyz_to_matrix
 from hingesplat.simd import parallel
 from hingesplat.stereo import DepthMap, seen_through
+
+log = logging.getLogger(__name__)
 
 WALL, DEEP = np.float32(0.5), np.float32(0.001)
 """How much lying just behind the part's own surface says for being inside, and lying farther behind, beside the 1 of a
@@ -94,7 +97,16 @@ def mesh_parts(
     config = config or MeshConfig()
     ids = [int(i) for i in gaussians.part.unique()]
     views = _depth_views(gaussians.detached(), states, ids, config, maps)
-    return {i: _mesh_part(gaussians[gaussians.part == i].detached(), views[i], config) for i in ids}
+    meshes = {}
+    for i in ids:
+        part = gaussians[gaussians.part == i].detached()
+        mesh, truncation = _close_part(views[i], config)
+        if mesh is None:
+            log.warning("part %d: its surface does not close; its convex hull stands in", i)
+            mesh = hull_mesh(part)
+        mesh.visual = ColorVisuals(mesh, vertex_colors=_vertex_colours(mesh, part, views[i], truncation))
+        meshes[i] = mesh
+    return meshes
 
 
 def fuse_depth(
@@ -186,25 +198,21 @@ def close_surface(distance: np.ndarray, lower: np.ndarray, voxel: float, config:
     return mesh if mesh.is_watertight and mesh.volume > 0 else None
 
 
-def _mesh_part(part: Gaussians, views: list[DepthView], config: MeshConfig) -> trimesh.Trimesh:
-    """One part: distance grid, rule for the unseen, closed surface, colours."""
+def _close_part(views: list[DepthView], config: MeshConfig) -> tuple[trimesh.Trimesh | None, float]:
+    """Distance grid, rule for the unseen, closed surface: the part's mesh, if there is one, and the truncation."""
     surface = _surface_points(views, config.resolution)
-    truncation, mesh = np.inf, None
-    if len(surface):
-        extent = float(np.ptp(surface, axis=0).max())
-        voxel = extent / config.resolution
-        truncation = config.truncation * voxel
-        lower = surface.min(0) - 3 * voxel
-        nx, ny, nz = (int(n) + 4 for n in np.ceil((surface.max(0) - lower) / voxel))
-        distance, weight = fuse_depth(views, lower, (nx, ny, nz), voxel, truncation)
-        unseen = weight == 0
-        solid = _solid_unseen(distance, unseen, surface, lower, voxel, config.reach * extent)
-        distance[unseen] = np.where(solid, -1, 1)[unseen]
-        mesh = close_surface(ndimage.gaussian_filter(distance, 0.5), lower, voxel, config)
-    if mesh is None:
-        mesh = hull_mesh(part)
-    mesh.visual = ColorVisuals(mesh, vertex_colors=_vertex_colours(mesh, part, views, truncation))
-    return mesh
+    if not len(surface):
+        return None, np.inf
+    extent = float(np.ptp(surface, axis=0).max())
+    voxel = extent / config.resolution
+    truncation = config.truncation * voxel
+    lower = surface.min(0) - 3 * voxel
+    nx, ny, nz = (int(n) + 4 for n in np.ceil((surface.max(0) - lower) / voxel))
+    distance, weight = fuse_depth(views, lower, (nx, ny, nz), voxel, truncation)
+    unseen = weight == 0
+    solid = _solid_unseen(distance, unseen, surface, lower, voxel, config.reach * extent)
+    distance[unseen] = np.where(solid, -1, 1)[unseen]
+    return close_surface(ndimage.gaussian_filter(distance, 0.5), lower, voxel, config), truncation
 
 
 def _solid_unseen(
@@ -219,19 +227,19 @@ def _solid_unseen(
     inside = unseen & hull
     index = np.argwhere(inside)
     away, _ = KDTree(surface).query(lower + voxel * index, distance_upper_bound=reach)
-    wall = inside & ~ndimage.binary_erosion(hull, iterations=max(round(reach / voxel), 1))
+    wall = inside & ~np.asarray(ndimage.binary_erosion(hull, iterations=max(round(reach / voxel), 1)), bool)
     wall[tuple(index.T)] |= np.isfinite(away)
-    pocket, count = ndimage.label(inside & ~wall)
+    pocket = np.zeros(distance.shape, np.int32)
+    ndimage.label(inside & ~wall, output=pocket)
+    count = int(pocket.max()) + 1
     seen = ~unseen & ndimage.binary_erosion(hull, iterations=4)
-    empty, full = seen & (distance > 0), wall | (~unseen & (distance <= 0))
-    open_, closed = (
-        sum(
-            np.bincount(pocket[np.roll(side, shift, axis)], minlength=count + 1)
-            for axis in range(3)
-            for shift in (1, -1)
-        )
-        for side in (empty, full)
-    )
+
+    def borders(side: np.ndarray) -> np.ndarray:
+        """The number of voxel faces that each pocket shares with ``side``."""
+        shifted = (np.roll(side, shift, axis) for axis in range(3) for shift in (1, -1))
+        return np.sum([np.bincount(pocket[s], minlength=count) for s in shifted], axis=0)
+
+    open_, closed = borders(seen & (distance > 0)), borders(wall | (~unseen & (distance <= 0)))
     hollow = open_ > HOLLOW * (open_ + closed)
     return wall | (inside & ~hollow[pocket])
 
@@ -353,9 +361,11 @@ def _integrate(total, weight, free, behind, P, T, truncation, depth, own, planes
                     s /= truncation
                     if s < -1:
                         behind[i, j, k] += WALL * max((3 + s) / 2, 0) + DEEP
-                    else:
-                        w = planes[v, u, 4] * (1 + min(s, 0.0))
-                        total[i, j, k] += w * min(s, 1.0)
+                    elif s > 1:
+                        free[i, j, k] += 1
+                    else:  # Votes fade at both ends alike, so that noise does not shift the surface.
+                        w = planes[v, u, 4] * min(2 - 2 * abs(s), 1.0)
+                        total[i, j, k] += w * s
                         weight[i, j, k] += w
 
 

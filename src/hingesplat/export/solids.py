@@ -151,10 +151,13 @@ def free_range(
     return reach(limits[0], min(most[0], limits[0])), reach(limits[1], max(most[1], limits[1]))
 
 
-def near(a: Sequence[trimesh.Trimesh], b: Sequence[trimesh.Trimesh], gap: float) -> bool:
-    """Whether a convex piece of one comes nearer than ``gap`` to one of the other."""
-    solids = [[manifold3d.Manifold.hull_points(np.asarray(h.vertices)) for h in hulls] for hulls in (a, b)]
-    return any(p.min_gap(q, gap) < gap for p in solids[0] for q in solids[1])
+def near(a: Sequence[manifold3d.Manifold], b: Sequence[manifold3d.Manifold], gap: float) -> bool:
+    """Whether a piece of one comes nearer than ``gap`` to one of the other."""
+    boxes = [np.array([p.bounding_box() for p in pieces]) for pieces in (a, b)]
+    low, high = (box[:, :3] for box in boxes), (box[:, 3:] for box in boxes)
+    (low_a, low_b), (high_a, high_b) = low, high
+    close = ((low_a[:, None] - gap < high_b) & (low_b - gap < high_a[:, None])).all(-1)
+    return any(a[i].min_gap(b[j], gap) < gap for i, j in np.argwhere(close))
 
 
 def _coarse(mesh: trimesh.Trimesh) -> manifold3d.Manifold:
