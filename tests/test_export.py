@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +26,8 @@ from hingesplat.export.solids import closed_mesh, collision_hulls, colours, mani
 from hingesplat.export.splats import read_ply, transformed, write_ply
 from hingesplat.gaussians import Gaussians, posed
 from hingesplat.render import sh_to_rgb
+from hingesplat.synth.objects import build
+from hingesplat.synth.shapes import solid_mesh
 from hingesplat.twin import Joint, Part, Twin
 
 Triple = tuple[float, float, float]
@@ -252,6 +255,45 @@ def test_programs_take_the_exports_without_a_warning(cabinet: Made, tmp_path: Pa
     for check in checks:
         assert check.ok and check.joints == 4 and check.contacts == (), check
         assert (check.error_percent is None) == (not check.program.startswith(("MuJoCo", "PyBullet")))
+
+
+def from_truth(name: str) -> Made:
+    """A made object as its own truth has it: meshes, joints, and the range between its two states."""
+    model = build(name, 0)
+    start, ids = model.state(0), {body.name: i for i, body in enumerate(model.bodies)}
+    meshes, joints = {}, []
+    for i, body in enumerate(model.bodies):
+        whole = trimesh.boolean.union([solid_mesh(solid) for solid in body.solids], engine="manifold")
+        meshes[i] = whole.apply_transform(start[body.name])
+        if hinge := body.hinge:
+            T, way = start[hinge.parent], hinge.states[1] - hinge.states[0]
+            axis, pivot = T[:3, :3] @ hinge.axis, T[:3, :3] @ hinge.origin + T[:3, 3]
+            span = (min(way, 0.0), max(way, 0.0))
+            joints.append(Joint(i, ids[hinge.parent], hinge.type, tuple(axis), tuple(pivot), (0.0, way), span))
+    return Twin(tuple(Part(i, name, 5) for name, i in ids.items()), tuple(joints)), meshes
+
+
+OLD_MUJOCO = Path(sys.prefix) / "mujoco-3.3"
+"""Where `make test` puts the oldest MuJoCo that is promised."""
+
+
+@pytest.mark.parametrize("form", ["urdf", "mjcf"])
+@pytest.mark.parametrize("name", ["latchdoor", "stapler3"])
+@pytest.mark.parametrize("old", [False, True], ids=["current", "3.3"])
+def test_mujoco_drives_chained_objects_end_to_end(
+    name: str, form: str, old: bool, tmp_path: Path, hulls: Path, monkeypatch
+):
+    pytest.importorskip("mujoco")
+    if old and not (OLD_MUJOCO / "mujoco").is_dir():
+        pytest.skip(f"no MuJoCo 3.3 in {OLD_MUJOCO}")
+    twin, meshes = made = from_truth(name)
+    assert len(meshes) == 3 and any(joint.parent != 0 for joint in twin.joints)
+    path = export(made, tmp_path, form, hulls)
+    if old:
+        monkeypatch.syspath_prepend(OLD_MUJOCO)
+    check = check_export(form, path)[0]
+    assert check.program.startswith("MuJoCo 3.3.") == old
+    assert check.ok and check.joints == 2 and check.error_percent < 2, check
 
 
 @pytest.mark.parametrize("form", ["urdf", "mjcf"])
@@ -503,6 +545,18 @@ def test_bad_input_gets_one_clear_line(name: str, cabinet: Made, tmp_path: Path,
     assert err.startswith("hingesplat: ") and err.count("\n") == 1 and out == ""
     assert word in err
     assert not list(run.glob("export/*/twin.*"))
+
+
+def test_a_mesh_that_cannot_be_closed_is_named_and_the_export_goes_on(cabinet: Made, tmp_path: Path, capfd):
+    pytest.importorskip("mujoco")
+    run = finished_run(cabinet, tmp_path / "run")
+    torn = cabinet[1][1].copy()
+    torn.update_faces(np.arange(12) > 1)
+    torn.export(run / "parts" / "1.glb")
+    assert cli.main(["export", str(run), "--format", "mjcf"]) == 0
+    out, err = capfd.readouterr()
+    assert err == "hingesplat: door: its mesh does not close; its convex hull stands in\n"
+    assert "mjcf in MuJoCo" in out and "4 joints" in out and "warnings: none" in out
 
 
 def test_a_check_that_fails_is_heard(capfd):

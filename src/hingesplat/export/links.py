@@ -118,15 +118,29 @@ def placement(twin: Twin, config: ExportConfig) -> tuple[np.ndarray, float]:
     return UP[config.up_axis], config.scale * twin.metres_per_unit
 
 
+def shapes(link: Link) -> list[tuple[str, str, str, trimesh.Trimesh]]:
+    """What a link shows and what it collides with: ``visual`` or ``collision``, a name, a file in the folder, the mesh.
+
+    Both in the link's frame.
+    """
+    if link.mesh is None:
+        return []
+    visual = ("visual", f"{link.name}_visual", f"meshes/{link.name}.obj", link.mesh)
+    numbered = enumerate(link.hulls)
+    hulls = [("collision", f"{link.name}_collision_{i}", f"collision/{link.name}_{i}.obj", h) for i, h in numbered]
+    return [visual, *hulls]
+
+
 def write_meshes(links: list[Link], out: Path) -> None:
-    """Write ``out/meshes/NAME.obj`` with textures and ``out/collision/NAME_NUMBER.obj``, in link frames."""
-    (out / "meshes").mkdir(parents=True, exist_ok=True)
-    (out / "collision").mkdir(exist_ok=True)
+    """Write the ``shapes`` of the links, those that are seen with textures."""
     for link in links:
-        if link.mesh is not None:
-            write_obj(link.mesh, out / "meshes" / f"{link.name}.obj")
-        for number, hull in enumerate(link.hulls):
-            write_text(out / "collision" / f"{link.name}_{number}.obj", export_obj(hull))
+        for what, _, file, mesh in shapes(link):
+            path = out / file
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if what == "visual":
+                write_obj(mesh, path)
+            else:
+                write_text(path, export_obj(mesh))
 
 
 def touching(links: list[Link]) -> list[tuple[Link, Link]]:

@@ -76,7 +76,7 @@ def collision_hulls(mesh: trimesh.Trimesh, cache: Path, *, most: int = 12) -> tu
     key = hashlib.sha256(vertices.tobytes() + faces.tobytes() + bytes([most])).hexdigest()[:16]
     file = cache / f"{key}.npz"
     with suppress(OSError, ValueError, EOFError), np.load(file, allow_pickle=False) as data:
-        return tuple(trimesh.convex.convex_hull(data[name]) for name in sorted(data.files))
+        return tuple(_as_trimesh(manifold3d.Manifold.hull_points(data[name])) for name in sorted(data.files))
     coarse = _as_trimesh(_coarse(mesh))
     coacd.set_log_level("error")
     try:
@@ -91,16 +91,17 @@ def collision_hulls(mesh: trimesh.Trimesh, cache: Path, *, most: int = 12) -> tu
             mcts_max_depth=2,
             seed=0,
         )
-        hulls = [trimesh.convex.convex_hull(points) for points, _ in pieces]
+        least = 1e-9 * np.ptp(vertices, axis=0).max() ** 3  # Some pieces are flat.
+        solids = [manifold3d.Manifold.hull_points(np.asarray(points)) for points, _ in pieces]
+        hulls = [_as_trimesh(solid) for solid in solids if solid.volume() > least]
     except (RuntimeError, ValueError, AssertionError) as e:
         log.warning("convex decomposition failed (%s); the convex hull stands in", e)
         hulls = []
-    hulls = [h for h in hulls if h.is_watertight and h.volume > 1e-9 * np.ptp(vertices, axis=0).max() ** 3]
     hulls = hulls or [mesh.convex_hull]
     with suppress(OSError):  # A folder that cannot be written costs only time.
         cache.mkdir(parents=True, exist_ok=True)
         with whole_file(file) as tmp, tmp.open("wb") as opened:  # Given a name, savez would add a suffix.
-            np.savez(opened, **{f"{i:03d}": h.vertices for i, h in enumerate(hulls)})
+            np.savez(opened, allow_pickle=False, **{f"{i:03d}": h.vertices for i, h in enumerate(hulls)})
     return tuple(hulls)
 
 
