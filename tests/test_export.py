@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +26,8 @@ from hingesplat.export.solids import closed_mesh, collision_hulls, colours, mani
 from hingesplat.export.splats import read_ply, transformed, write_ply
 from hingesplat.gaussians import Gaussians, posed
 from hingesplat.render import sh_to_rgb
+from hingesplat.synth.objects import build
+from hingesplat.synth.shapes import solid_mesh
 from hingesplat.twin import Joint, Part, Twin
 
 Triple = tuple[float, float, float]
@@ -252,6 +255,45 @@ def test_programs_take_the_exports_without_a_warning(cabinet: Made, tmp_path: Pa
     for check in checks:
         assert check.ok and check.joints == 4 and check.contacts == (), check
         assert (check.error_percent is None) == (not check.program.startswith(("MuJoCo", "PyBullet")))
+
+
+def from_truth(name: str) -> Made:
+    """A made object as its own truth has it: meshes, joints, and the range between its two states."""
+    model = build(name, 0)
+    start, ids = model.state(0), {body.name: i for i, body in enumerate(model.bodies)}
+    meshes, joints = {}, []
+    for i, body in enumerate(model.bodies):
+        whole = trimesh.boolean.union([solid_mesh(solid) for solid in body.solids], engine="manifold")
+        meshes[i] = whole.apply_transform(start[body.name])
+        if hinge := body.hinge:
+            T, way = start[hinge.parent], hinge.states[1] - hinge.states[0]
+            axis, pivot = T[:3, :3] @ hinge.axis, T[:3, :3] @ hinge.origin + T[:3, 3]
+            span = (min(way, 0.0), max(way, 0.0))
+            joints.append(Joint(i, ids[hinge.parent], hinge.type, tuple(axis), tuple(pivot), (0.0, way), span))
+    return Twin(tuple(Part(i, name, 5) for name, i in ids.items()), tuple(joints)), meshes
+
+
+OLD_MUJOCO = Path(sys.prefix) / "mujoco-3.3"
+"""Where `make test` puts the oldest MuJoCo that is promised."""
+
+
+@pytest.mark.parametrize("form", ["urdf", "mjcf"])
+@pytest.mark.parametrize("name", ["latchdoor", "stapler3"])
+@pytest.mark.parametrize("old", [False, True], ids=["current", "3.3"])
+def test_mujoco_drives_chained_objects_end_to_end(
+    name: str, form: str, old: bool, tmp_path: Path, hulls: Path, monkeypatch
+):
+    pytest.importorskip("mujoco")
+    if old and not (OLD_MUJOCO / "mujoco").is_dir():
+        pytest.skip(f"no MuJoCo 3.3 in {OLD_MUJOCO}")
+    twin, meshes = made = from_truth(name)
+    assert len(meshes) == 3 and any(joint.parent != 0 for joint in twin.joints)
+    path = export(made, tmp_path, form, hulls)
+    if old:
+        monkeypatch.syspath_prepend(OLD_MUJOCO)
+    check = check_export(form, path)[0]
+    assert check.program.startswith("MuJoCo 3.3.") == old
+    assert check.ok and check.joints == 2 and check.error_percent < 2, check
 
 
 @pytest.mark.parametrize("form", ["urdf", "mjcf"])
@@ -505,6 +547,18 @@ def test_bad_input_gets_one_clear_line(name: str, cabinet: Made, tmp_path: Path,
     assert not list(run.glob("export/*/twin.*"))
 
 
+def test_a_mesh_that_cannot_be_closed_is_named_and_the_export_goes_on(cabinet: Made, tmp_path: Path, capfd):
+    pytest.importorskip("mujoco")
+    run = finished_run(cabinet, tmp_path / "run")
+    torn = cabinet[1][1].copy()
+    torn.update_faces(np.arange(12) > 1)
+    torn.export(run / "parts" / "1.glb")
+    assert cli.main(["export", str(run), "--format", "mjcf"]) == 0
+    out, err = capfd.readouterr()
+    assert err == "hingesplat: door: its mesh does not close; its convex hull stands in\n"
+    assert "mjcf in MuJoCo" in out and "4 joints" in out and "warnings: none" in out
+
+
 def test_a_check_that_fails_is_heard(capfd):
     cli.show_check(cli.Console(), "mjcf", Check("MuJoCo 0", 2, 31.4, ("base and door",)))
     cli.show_check(cli.Console(), "usd", Check("UsdValidation 0", 2, warnings=("no root",)))
@@ -652,23 +706,52 @@ def test_every_format_is_written_and_moves_as_a_folder(cabinet: Made, tmp_path: 
     assert not list(tmp_path.rglob("*.tmp*"))
 
 
-def test_parts_that_touched_in_a_photographed_state_may_touch(tmp_path: Path) -> None:
-    """Two drawers side by side, one opening while the other closes: their meshes meet in state 1 only."""
+def drawers(gap: float, reach: tuple[float, float], states: tuple[float, float]) -> Made:
+    """Two drawers with wide fronts, one above the other's way: they slide towards each other."""
     meshes = {
         0: box((1, 0.2, 0.2), (0, 0.5, 0), (180, 140, 100)),
-        1: box((0.2, 0.2, 0.2), (-0.2, 0, 0), (200, 40, 40)),
-        2: box((0.2, 0.2, 0.2), (0.2, 0, 0), (40, 40, 200)),
+        1: box((0.2, 0.2, 0.2), (-0.1 - gap / 2, 0, 0), (200, 40, 40)),
+        2: box((0.2, 0.2, 0.2), (0.1 + gap / 2, 0, 0), (40, 40, 200)),
     }
     joints = tuple(
-        Joint(i, 0, "prismatic", (x, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, far), (0.0, far))
-        for i, x, far in ((1, 1.0, 0.1), (2, -1.0, 0.1))
+        Joint(i, 0, "prismatic", (x, 0.0, 0.0), (0.0, 0.0, 0.0), states, reach) for i, x in ((1, 1.0), (2, -1.0))
     )
-    twin = Twin(tuple(Part(i, f"p{i}", 5) for i in range(3)), joints)
-    for scale in (1.0, 2.5):
-        links = build_links(twin, meshes, ExportConfig(scale=scale), tmp_path)
-        np.testing.assert_allclose(links[1].pose(1)[:3, 3], [0.1 * scale, 0, 0], atol=1e-12)
-        pairs = {frozenset((a.name, b.name)) for a, b in touching(links)}
-        assert frozenset(("p1", "p2")) in pairs
-    apart = replace(twin, joints=tuple(replace(j, states=(0.0, 0.02)) for j in joints))
-    links = build_links(apart, meshes, ExportConfig(), tmp_path)
-    assert frozenset(("p1", "p2")) not in {frozenset((a.name, b.name)) for a, b in touching(links)}
+    return Twin(tuple(Part(i, f"p{i}", 5) for i in range(3)), joints), meshes
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.5])
+@pytest.mark.parametrize(
+    ("reach", "states", "meet"),
+    [
+        ((0.0, 0.2), (0.0, 0.1), True),  # In a photographed state.
+        ((0.0, 0.2), (0.0, 0.02), True),  # Beyond both, where the limits let them go.
+        ((0.0, 0.05), (0.0, 0.02), False),
+    ],
+)
+def test_parts_whose_ways_cross_pass_through_each_other(
+    tmp_path: Path, scale: float, reach, states, meet: bool
+) -> None:
+    links = build_links(*drawers(0.2, reach, states), ExportConfig(scale=scale), tmp_path)
+    pose = links[1].pose(lambda link: link.joint.states[1] if link.joint else 0.0)
+    np.testing.assert_allclose(pose[:3, 3], [states[1] * scale, 0, 0], atol=1e-12)
+    pairs = {frozenset((a.name, b.name)) for a, b in touching(links)}
+    assert (frozenset(("p1", "p2")) in pairs) == meet
+    assert {frozenset(("base", "p1")), frozenset(("base", "p2"))} <= pairs
+
+
+def test_parts_that_pass_through_each_other_are_named_by_the_check(tmp_path: Path, capfd) -> None:
+    pytest.importorskip("mujoco")
+    # The one's way crosses where the other rests: with contacts it would be stopped at half of its range.
+    made = drawers(0.1, (0.0, 0.2), (0.0, 0.05))
+    path = export(made, tmp_path, "mjcf", tmp_path)
+    (check,) = check_export("mjcf", path)
+    assert check.ok and check.contacts == () and check.ignored == ("p1 and p2",)
+    cli.show_check(cli.Console(), "mjcf", check)
+    assert "may pass through each other, as their meshes meet: p1 and p2" in " ".join(capfd.readouterr().out.split())
+    root = etree.parse(path)
+    for exclude in root.findall("contact/exclude"):
+        if exclude.get("body2") == "p2" and exclude.get("body1") == "p1":
+            exclude.getparent().remove(exclude)
+    root.write(path)
+    (check,) = check_export("mjcf", path)
+    assert not check.ok and check.error_percent > 10 and check.contacts == ("p1 and p2",)

@@ -21,6 +21,7 @@ from hingesplat.mesh import (
     tangent_planes,
 )
 from hingesplat.se3 import matrix_to_wxyz
+from hingesplat.stereo import DepthMap
 from hingesplat.twin import Joint
 
 
@@ -174,3 +175,60 @@ def test_a_sheet_seen_from_one_side_is_a_thin_solid_not_a_brick():
     assert mesh.is_watertight
     assert mesh.extents[1] < 0.15
     assert mesh.extents[[0, 2]] == pytest.approx([0.8, 0.8], abs=0.1)
+
+
+def open_box(extents: tuple[float, float, float], wall: float) -> trimesh.Trimesh:
+    """A drawer: a box without a lid."""
+    inner = np.array(extents) - [2 * wall, 2 * wall, 0]
+    hole = trimesh.creation.box(inner, trimesh.transformations.translation_matrix([0, 0, wall]))
+    return trimesh.boolean.difference([trimesh.creation.box(extents), hole], engine="manifold")
+
+
+def known_depth(camera: Camera, mesh: trimesh.Trimesh) -> DepthMap:
+    view = traced(camera, mesh)
+    return DepthMap(camera, np.where(np.isfinite(view.depth), view.depth, 0).astype(np.float32), view.rgb)
+
+
+def test_a_drawer_under_a_painted_lid_is_hollow_where_stereo_sees_into_it_in_either_state():
+    """Shut, its inside is hidden by the base above it; pulled out, photographs look in. The fit is a solid box."""
+    extents, far = (0.6, 0.5, 0.24), 0.6
+    drawer = open_box(extents, 0.05)
+    cover = trimesh.creation.box((0.8, 0.6, 0.2), trimesh.transformations.translation_matrix([0, 0.02, 0.24]))
+    scene = concatenate(
+        [box_gaussians((0.8, 0.6, 0.2), (0, 0.02, 0.24), 0, 0.05), box_gaussians(extents, (0, 0, 0), 1, 0.05)]
+    )
+    joint = Joint(1, 0, "prismatic", (0.0, -1.0, 0.0), (0.0, 0.0, 0.0), (0.0, far), (0.0, far))
+    cameras = sphere_of_cameras(24)
+    states = [(cameras, {0: np.eye(4), 1: joint.transform(value)}) for value in joint.states]
+    maps = []
+    for _, poses in states:
+        whole = trimesh.util.concatenate([cover, drawer.copy().apply_transform(poses[1])])
+        maps.append([known_depth(camera, whole) for camera in cameras])
+    config = MeshConfig(resolution=48, image_size=96)
+    solid, hollow = (mesh_parts(scene, states, config, maps=m)[1] for m in ((), maps))
+    assert solid.volume > 0.8 * drawer.convex_hull.volume
+    assert hollow.is_watertight and hollow.volume == pytest.approx(drawer.volume, rel=0.1)
+    assert drawer.volume < 0.6 * drawer.convex_hull.volume
+    surface, _ = trimesh.sample.sample_surface(drawer, 20_000, seed=0)
+    assert KDTree(surface).query(trimesh.sample.sample_surface(hollow, 5_000, seed=0)[0])[0].mean() < 0.01
+
+
+def test_a_block_is_solid_though_no_camera_sees_its_underside():
+    shape = trimesh.creation.box((0.8, 0.8, 0.5))
+    cameras = [c for c in sphere_of_cameras(36) if c.centre[2] > 0.3]
+    maps = [[known_depth(c, shape) for c in cameras]]
+    scene = box_gaussians((0.8, 0.8, 0.5), (0, 0, 0), 0)
+    mesh = mesh_parts(scene, [(cameras, {})], MeshConfig(resolution=48, image_size=96), maps=maps)[0]
+    assert mesh.is_watertight and mesh.volume == pytest.approx(shape.volume, rel=0.1)
+
+
+def test_what_is_unseen_in_the_depth_of_an_open_carcass_is_empty():
+    """Only its back and floor are seen through the opening, and behind the walls there is no more than a wall."""
+    lying = trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])
+    carcass = open_box((0.8, 0.8, 0.8), 0.05).apply_transform(lying)
+    front = [c for c in sphere_of_cameras(120) if c.centre[1] < -2.9]
+    cameras = front + [c for c in sphere_of_cameras(24) if c.centre[1] > -1]
+    maps = [[known_depth(c, carcass) for c in cameras]]
+    scene = box_gaussians((0.8, 0.8, 0.8), (0, 0, 0), 0)
+    mesh = mesh_parts(scene, [(cameras, {})], MeshConfig(resolution=48, image_size=96), maps=maps)[0]
+    assert mesh.is_watertight and mesh.volume == pytest.approx(carcass.volume, rel=0.1)

@@ -534,6 +534,8 @@ def show_check(console: Console, form: str, check: "Check") -> None:
     if check.error_percent is not None:
         parts.append(f"worst tracking error {check.error_percent:.2g} % of range")
         parts.append(f"contacts: {'; '.join(check.contacts) or 'none'}")
+        if check.ignored:
+            parts.append(f"may pass through each other, as their meshes meet: {'; '.join(check.ignored)}")
     parts.append(f"warnings: {len(check.warnings) or 'none'}")
     console.print(f"  {form} in {check.program}: {', '.join(parts)}", soft_wrap=True)
     for warning in check.warnings:

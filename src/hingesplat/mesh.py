@@ -1,10 +1,12 @@
-"""Part meshes: fuse rendered depth of both states into one signed distance grid a part, then close it.
+"""Part meshes: fuse depth of all states into one signed distance grid a part, then close it.
 
-Truncated signed distance fusion (Curless and Levoy 1996) with point-to-plane distances. What no view ever saw
-counts as inside only near the part's own Gaussians, so a sheet seen from one side closes into a thin solid,
-not into a brick.
+Truncated signed distance fusion (Curless and Levoy 1996) with point-to-plane distances. Depth is that of the
+Gaussians, and where stereo contradicts it, that of stereo: fits put lids on hollows. A view of any state carves a
+part in the part's own frame. What no view ever saw is solid behind the surfaces that were seen, as thick as a wall,
+and farther in where these close around it.
 """
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -13,7 +15,7 @@ import numba
 import numpy as np
 import torch
 import trimesh
-from scipy.ndimage import gaussian_filter
+from scipy import ndimage
 from scipy.spatial import ConvexHull, KDTree, QhullError
 from skimage.measure import marching_cubes
 from trimesh.visual import ColorVisuals
@@ -22,6 +24,16 @@ from hingesplat.camera import Camera
 from hingesplat.gaussians import SH_C0, Gaussians, posed
 from hingesplat.render import rasterize
 from hingesplat.se3 import wxyz_to_matrix
+from hingesplat.simd import parallel
+from hingesplat.stereo import DepthMap, seen_through
+
+log = logging.getLogger(__name__)
+
+WALL, DEEP = np.float32(0.5), np.float32(0.001)
+"""How much lying just behind the part's own surface says for being inside, and lying farther behind, beside the 1 of a
+view that sees through. It takes several good views to hollow a wall, and few to see into what lies behind it."""
+HOLLOW = 0.2
+"""An unseen pocket is empty where more than this share of what borders on it was seen to be."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +49,7 @@ class MeshConfig:
     truncation: float = 2.5
     """Depth of the band behind a surface, voxels; at most half of the thinnest wall."""
     reach: float = 0.04
-    """How far from its Gaussians unseen space belongs to a movable part; fraction of its longest side."""
+    """How far behind its surface unseen space belongs to a part in any case; fraction of its longest side."""
     spread: float = 0.02
     """Pixels whose blended depths deviate by more than this (fraction of the scene) are not used."""
     floater: float = 0.02
@@ -66,6 +78,8 @@ def mesh_parts(
     gaussians: Gaussians,
     states: Sequence[tuple[Sequence[Camera], Mapping[int, np.ndarray]]],
     config: MeshConfig | None = None,
+    *,
+    maps: Sequence[Sequence[DepthMap]] = (),
 ) -> dict[int, trimesh.Trimesh]:
     """Closed, coloured triangle meshes of every part, in the frame of state 0.
 
@@ -74,6 +88,7 @@ def mesh_parts(
         states: for each state its cameras (world frame) and its part poses ``{part id: T_state_part0}``
             (4×4), as ``Twin.at_state`` gives them.
         config: defaults when None.
+        maps: for each state the depth that stereo knows of each of its cameras; without them, rendered depth is all.
 
     Returns:
         ``{part id: mesh}``: watertight 2-manifolds with vertex colours; the convex hull of a part's Gaussians
@@ -81,8 +96,17 @@ def mesh_parts(
     """
     config = config or MeshConfig()
     ids = [int(i) for i in gaussians.part.unique()]
-    views = _depth_views(gaussians.detached(), states, ids, config)
-    return {i: _mesh_part(gaussians[gaussians.part == i].detached(), views[i], i == 0, config) for i in ids}
+    views = _depth_views(gaussians.detached(), states, ids, config, maps)
+    meshes = {}
+    for i in ids:
+        part = gaussians[gaussians.part == i].detached()
+        mesh, truncation = _close_part(views[i], config)
+        if mesh is None:
+            log.warning("part %d: its surface does not close; its convex hull stands in", i)
+            mesh = hull_mesh(part)
+        mesh.visual = ColorVisuals(mesh, vertex_colors=_vertex_colours(mesh, part, views[i], truncation))
+        meshes[i] = mesh
+    return meshes
 
 
 def fuse_depth(
@@ -105,16 +129,19 @@ def fuse_depth(
         ``distance`` in [-1, 1] (units of the truncation, positive outside) and ``weight`` (0 where no view
         saw free space or a surface), both float32 of ``shape``.
     """
-    total, weight, behind = (np.zeros(shape, np.float32) for _ in range(3))
+    total, weight, free, behind = (np.zeros(shape, np.float32) for _ in range(4))
+    T_part_grid = np.diag([voxel, voxel, voxel, 1.0])
+    T_part_grid[:3, 3] = lower
     for view in views:
-        T = view.camera.T_camera_world
-        K = np.array([view.camera.fx, view.camera.fy, view.camera.cx, view.camera.cy])
-        _integrate(total, weight, behind, T, K, lower, voxel, truncation, view.depth, view.own, view.planes)
-    # Lying behind the part's own surface is weak evidence of being inside: many such views outvote one stray
-    # ray, and a few good ones see into a hollow.
-    behind *= np.float32(0.03)
-    distance = (total - behind) / np.maximum(weight + behind, 1e-6)
-    return np.where(weight > 0, distance, -1).astype(np.float32), weight
+        T = view.camera.T_camera_world[:3] @ T_part_grid
+        parallel(
+            _integrate, torch.get_num_threads(), total, weight, free, behind,
+            (view.camera.K @ T).astype(np.float32), T.astype(np.float32),
+            np.float32(truncation), view.depth, view.own, view.planes,
+        )  # fmt: skip
+    free = np.maximum(free - behind, 0)
+    weight += free
+    return np.where(weight > 0, (total + free) / np.maximum(weight, 1e-6), -1).astype(np.float32), weight
 
 
 def tangent_planes(camera: Camera, depth: np.ndarray) -> np.ndarray:
@@ -171,32 +198,50 @@ def close_surface(distance: np.ndarray, lower: np.ndarray, voxel: float, config:
     return mesh if mesh.is_watertight and mesh.volume > 0 else None
 
 
-def _mesh_part(part: Gaussians, views: list[DepthView], is_base: bool, config: MeshConfig) -> trimesh.Trimesh:
-    """One part: distance grid, rule for the unseen, closed surface, colours."""
-    solid = _solid_gaussians(part, views)
-    corners = _ellipsoid_points(solid)
-    extent = float(np.ptp(corners, axis=0).max())
+def _close_part(views: list[DepthView], config: MeshConfig) -> tuple[trimesh.Trimesh | None, float]:
+    """Distance grid, rule for the unseen, closed surface: the part's mesh, if there is one, and the truncation."""
+    surface = _surface_points(views, config.resolution)
+    if not len(surface):
+        return None, np.inf
+    extent = float(np.ptp(surface, axis=0).max())
     voxel = extent / config.resolution
     truncation = config.truncation * voxel
-    lower = corners.min(0) - 3 * voxel
-    nx, ny, nz = (int(n) + 4 for n in np.ceil((corners.max(0) - lower) / voxel))
-    shape = (nx, ny, nz)
-    distance, weight = fuse_depth(views, lower, shape, voxel, truncation)
-
+    lower = surface.min(0) - 3 * voxel
+    nx, ny, nz = (int(n) + 4 for n in np.ceil((surface.max(0) - lower) / voxel))
+    distance, weight = fuse_depth(views, lower, (nx, ny, nz), voxel, truncation)
     unseen = weight == 0
-    inside = unseen & _hull_grid(corners, lower, shape, voxel)
-    if not is_base:
-        # A brick must not grow behind a door; hollows that stay enclosed are filled by close_surface.
-        index = np.argwhere(inside)
-        tree = KDTree(solid.means.double().numpy())
-        away, _ = tree.query(lower + voxel * index, distance_upper_bound=config.reach * extent)
-        inside[tuple(index.T)] = np.isfinite(away)
-    distance[unseen] = np.where(inside, -1, 1)[unseen]
-    mesh = close_surface(gaussian_filter(distance, 0.5), lower, voxel, config)
-    if mesh is None:
-        mesh = hull_mesh(solid)
-    mesh.visual = ColorVisuals(mesh, vertex_colors=_vertex_colours(mesh, part, views, truncation))
-    return mesh
+    solid = _solid_unseen(distance, unseen, surface, lower, voxel, config.reach * extent)
+    distance[unseen] = np.where(solid, -1, 1)[unseen]
+    return close_surface(ndimage.gaussian_filter(distance, 0.5), lower, voxel, config), truncation
+
+
+def _solid_unseen(
+    distance: np.ndarray, unseen: np.ndarray, surface: np.ndarray, lower: np.ndarray, voxel: float, reach: float
+) -> np.ndarray:
+    """Which unseen voxels belong to the part: those of its walls, and pockets that these close.
+
+    Walls are ``reach`` thick and stand on the surface (n, 3) and, as what it stands on is rarely photographed, on its
+    convex hull. A pocket between them is empty where it lies open towards space that was seen to be empty.
+    """
+    hull = _hull_grid(surface, lower, distance.shape, voxel)
+    inside = unseen & hull
+    index = np.argwhere(inside)
+    away, _ = KDTree(surface).query(lower + voxel * index, distance_upper_bound=reach)
+    wall = inside & ~np.asarray(ndimage.binary_erosion(hull, iterations=max(round(reach / voxel), 1)), bool)
+    wall[tuple(index.T)] |= np.isfinite(away)
+    pocket = np.zeros(distance.shape, np.int32)
+    ndimage.label(inside & ~wall, output=pocket)
+    count = int(pocket.max()) + 1
+    seen = ~unseen & ndimage.binary_erosion(hull, iterations=4)
+
+    def borders(side: np.ndarray) -> np.ndarray:
+        """The number of voxel faces that each pocket shares with ``side``."""
+        shifted = (np.roll(side, shift, axis) for axis in range(3) for shift in (1, -1))
+        return np.sum([np.bincount(pocket[s], minlength=count) for s in shifted], axis=0)
+
+    open_, closed = borders(seen & (distance > 0)), borders(wall | (~unseen & (distance <= 0)))
+    hollow = open_ > HOLLOW * (open_ + closed)
+    return wall | (inside & ~hollow[pocket])
 
 
 def hull_mesh(gaussians: Gaussians) -> trimesh.Trimesh:
@@ -218,56 +263,89 @@ def _depth_views(
     states: Sequence[tuple[Sequence[Camera], Mapping[int, np.ndarray]]],
     ids: list[int],
     config: MeshConfig,
+    maps: Sequence[Sequence[DepthMap]],
 ) -> dict[int, list[DepthView]]:
-    """Render every view once, the whole scene, so that a surface that another part hides stays silent."""
+    """Look from every camera once, at the whole scene, so that a surface that another part hides stays silent."""
     views: dict[int, list[DepthView]] = {i: [] for i in ids}
     span = gaussians.means.quantile(0.98, 0) - gaussians.means.quantile(0.02, 0)
     limit = config.spread * float(span.norm())
-    membership = (gaussians.part[:, None] == torch.tensor(ids)).float()
-    for cameras, poses in states:
+    for t, (cameras, poses) in enumerate(states):
         scene = posed(gaussians, poses)
         step = max(1.0, len(cameras) / config.views)
-        for full in (cameras[int(k)] for k in np.arange(0, len(cameras), step)):
+        for number in (int(k) for k in np.arange(0, len(cameras), step)):
+            full = cameras[number]
             shrink = min(1.0, config.image_size / max(full.width, full.height))
             camera = full.scaled(max(1, round(full.width * shrink)), max(1, round(full.height * shrink)))
-            T = torch.tensor(camera.T_camera_world, dtype=scene.means.dtype)
-            z = scene.means @ T[2, :3] + T[2, 3]
-            colours = (0.5 + SH_C0 * scene.sh[:, 0]).clamp(min=0)
-            with torch.no_grad():
-                out = rasterize(
-                    scene.means, scene.quats, scene.scales, scene.opacities, colours, camera,
-                    channels=torch.cat([membership, z[:, None] ** 2], 1),
-                )  # fmt: skip
-            alpha, channels = out.alpha.numpy(), out.channels.numpy()
-            safe = np.maximum(alpha, 1e-6)
-            mean = out.depth.numpy() / safe
-            deviation = np.sqrt(np.maximum(channels[-1] / safe - mean**2, 0))
-            solid = (alpha > 0.5) & (deviation < limit)
-            depth = np.where(solid, mean, np.where(alpha < 0.5, np.inf, np.nan)).astype(np.float32)
-            rgb = np.clip(out.rgb.numpy() / safe, 0, 1).transpose(1, 2, 0).astype(np.float32)
+            if maps:
+                camera = maps[t][number].camera
+            depth, part, rgb = _rendered(scene, camera, ids, limit)
+            if maps:
+                _correct(depth, part, scene, maps[t], number, limit)
             planes = tangent_planes(camera, depth)
-            for k, i in enumerate(ids):
+            for i in ids:
                 T_part_camera = np.linalg.inv(poses.get(i, np.eye(4))) @ camera.T_world_camera
-                own = solid & (channels[k] > 0.8 * alpha)
-                views[i].append(DepthView(replace(camera, T_world_camera=T_part_camera), depth, own, rgb, planes))
+                views[i].append(DepthView(replace(camera, T_world_camera=T_part_camera), depth, part == i, rgb, planes))
     return views
 
 
-@numba.njit(cache=True, nogil=True, fastmath=False)
-def _integrate(total, weight, behind, T, K, lower, voxel, truncation, depth, own, planes):
-    """Add one view to the grid, in place."""
+@torch.no_grad()
+def _rendered(
+    scene: Gaussians, camera: Camera, ids: list[int], limit: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Depth (h, w) as in ``DepthView``, part (h, w), -1 where it is not known, and colour (h, w, 3)."""
+    T = torch.tensor(camera.T_camera_world, dtype=scene.means.dtype)
+    z = scene.means @ T[2, :3] + T[2, 3]
+    colours = (0.5 + SH_C0 * scene.sh[:, 0]).clamp(min=0)
+    membership = (scene.part[:, None] == torch.tensor(ids)).float()
+    out = rasterize(
+        scene.means, scene.quats, scene.scales, scene.opacities, colours, camera,
+        channels=torch.cat([membership, z[:, None] ** 2], 1),
+    )  # fmt: skip
+    alpha, channels = out.alpha.numpy(), out.channels.numpy()
+    safe = np.maximum(alpha, 1e-6)
+    mean = out.depth.numpy() / safe
+    deviation = np.sqrt(np.maximum(channels[-1] / safe - mean**2, 0))
+    solid = (alpha > 0.5) & (deviation < limit)
+    depth = np.where(solid, mean, np.where(alpha < 0.5, np.inf, np.nan)).astype(np.float32)
+    most = channels[:-1].argmax(0)
+    sure = solid & (channels[:-1].max(0) > 0.8 * alpha)
+    part = np.where(sure, np.asarray(ids)[most], -1)
+    return depth, part, np.clip(out.rgb.numpy() / safe, 0, 1).transpose(1, 2, 0).astype(np.float32)
+
+
+def _correct(
+    depth: np.ndarray, part: np.ndarray, scene: Gaussians, maps: Sequence[DepthMap], number: int, limit: float
+) -> None:
+    """Put in, in place, what stereo knows better: its depth where the two differ, nothing where it sees through."""
+    camera, known = maps[number].camera, maps[number].depth
+    y, x = np.nonzero(np.isfinite(depth) & (known == 0))
+    lid = seen_through(camera.lifted(x, y, depth[y, x]), maps, limit) >= 2
+    depth[y[lid], x[lid]], part[y[lid], x[lid]] = np.nan, -1
+    # Where they agree, the rendered depth is the smoother one.
+    y, x = np.nonzero((known > 0) & ((part < 0) | ~(np.abs(known - depth) < 0.5 * limit)))
+    depth[y, x] = known[y, x]
+    seen = scene[scene.opacities > 0.1]
+    if len(y) and len(seen):
+        nearest = KDTree(seen.means.numpy()).query(camera.lifted(x, y, known[y, x]))[1]
+        part[y, x] = seen.part.numpy()[nearest]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _integrate(total, weight, free, behind, P, T, truncation, depth, own, planes, thread, threads):  # pragma: no cover
+    """Add one view to the grid, in place. ``P`` (3, 4) takes voxels to pixels, ``T`` (3, 4) to the camera's frame."""
     height, width = depth.shape
     nx, ny, nz = total.shape
-    for i in range(nx):
+    for i in range(thread, nx, threads):
         for j in range(ny):
+            a0 = P[0, 0] * i + P[0, 1] * j + P[0, 3]
+            b0 = P[1, 0] * i + P[1, 1] * j + P[1, 3]
+            z0 = P[2, 0] * i + P[2, 1] * j + P[2, 3]
             for k in range(nz):
-                px, py, pz = lower[0] + i * voxel, lower[1] + j * voxel, lower[2] + k * voxel
-                z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+                z = z0 + P[2, 2] * k
                 if z <= 1e-6:
                     continue
-                x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
-                y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-                a, b = K[0] * x / z + K[2], K[1] * y / z + K[3]
+                inverse = 1 / z
+                a, b = (a0 + P[0, 2] * k) * inverse, (b0 + P[1, 2] * k) * inverse
                 if a < 0 or b < 0 or a >= width or b >= height:
                     continue
                 u, v = int(a), int(b)
@@ -275,36 +353,43 @@ def _integrate(total, weight, behind, T, K, lower, voxel, truncation, depth, own
                 if np.isnan(d):
                     continue
                 if z < d - 4 * truncation or (not own[v, u] and z < d - truncation):
-                    total[i, j, k] += 1
-                    weight[i, j, k] += 1
+                    free[i, j, k] += 1
                 elif own[v, u] and planes[v, u, 4] > 0:
+                    x = T[0, 0] * i + T[0, 1] * j + T[0, 2] * k + T[0, 3]
+                    y = T[1, 0] * i + T[1, 1] * j + T[1, 2] * k + T[1, 3]
                     s = planes[v, u, 0] * x + planes[v, u, 1] * y + planes[v, u, 2] * z + planes[v, u, 3]
                     s /= truncation
                     if s < -1:
-                        behind[i, j, k] += 1
-                    else:
-                        w = planes[v, u, 4] * (1 + min(s, 0.0))
-                        total[i, j, k] += w * min(s, 1.0)
+                        behind[i, j, k] += WALL * max((3 + s) / 2, 0) + DEEP
+                    elif s > 1:
+                        free[i, j, k] += 1
+                    else:  # Votes fade at both ends alike, so that noise does not shift the surface.
+                        w = planes[v, u, 4] * min(2 - 2 * abs(s), 1.0)
+                        total[i, j, k] += w * s
                         weight[i, j, k] += w
 
 
-def _solid_gaussians(part: Gaussians, views: list[DepthView]) -> Gaussians:
-    """The part's Gaussians on surfaces that views see; strays and the never seen would bloat its box."""
-    points = part.means.double().numpy()
-    spread = np.sqrt((part.scales.double().numpy() ** 2).sum(1))
-    seen = np.zeros(len(points), int)
+def _surface_points(views: Sequence[DepthView], resolution: int) -> np.ndarray:
+    """(n, 3) points on the part's surface, one for each cell of a voxel's size that at least three pixels see.
+
+    Stragglers are left out; without enough of them (16) there are none.
+    """
+    seen = []
     for view in views:
-        inside, u, v, z = _pixels(points, view)
-        at = view.depth[v, u]
-        seen[inside] += view.own[v, u] & (np.abs(z - at) < 2 * spread[inside])
-    keep = (seen >= min(2, len(views))) & (part.opacities.numpy() > 0.1)
-    if keep.sum() < 16:
-        keep[:] = True
-    index = np.flatnonzero(keep)
-    if len(index) > 16:
-        gap = KDTree(points[index]).query(points[index], k=9)[0][:, -1]
-        index = index[gap <= 6 * np.median(gap) + 1e-12]
-    return part[torch.from_numpy(index)]
+        y, x = np.nonzero(view.own & np.isfinite(view.depth))
+        seen.append(view.camera.lifted(x, y, view.depth[y, x].astype(float)))
+    points = np.concatenate(seen)
+    if len(points) < 16:
+        return points[:0]
+    size = float((np.quantile(points, 0.99, axis=0) - np.quantile(points, 0.01, axis=0)).max()) / resolution
+    cells = np.floor(points / max(size, 1e-9)).astype(np.int64)
+    _, cell, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    mean = np.stack([np.bincount(cell.ravel(), a) for a in points.T], 1) / count[:, None]
+    mean = mean[count >= 3]
+    if len(mean) < 16:
+        return mean[:0]
+    gap = KDTree(mean).query(mean, k=9)[0][:, -1]
+    return mean[gap <= 4 * np.median(gap)]
 
 
 def _ellipsoid_points(gaussians: Gaussians) -> np.ndarray:

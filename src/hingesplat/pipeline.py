@@ -415,7 +415,8 @@ def _joints(run: Run) -> None:
 def _mesh(run: Run) -> None:
     gaussians, twin = load_result(run.folder)
     states = [([v.camera for v in views], twin.at_state(t)) for t, views in enumerate(run.views)]
-    meshes = mesh_parts(gaussians, states, run.config.mesh)
+    maps = [_depth(run, t) for t in range(len(states))]
+    meshes = mesh_parts(gaussians, states, run.config.mesh, maps=maps)
     parts = []
     with whole_folder(run / "parts") as folder:
         for part in twin.parts:

@@ -42,6 +42,8 @@ class Check:
     """Worst distance from the target at either end, of the joint's range; None where nothing was driven."""
     contacts: tuple[str, ...] = ()
     """Pairs of parts that touched on the way."""
+    ignored: tuple[str, ...] = ()
+    """Pairs of parts, neither of which carries the other, that pass through each other: their meshes meet."""
     warnings: tuple[str, ...] = ()
     """Why it failed comes first."""
 
@@ -108,8 +110,9 @@ def _check(program: str, path: Path) -> Check:
         found = json.loads(result)
     except json.JSONDecodeError:
         return Check(program, warnings=(f"stopped with exit code {done.returncode}", *warnings[-3:]))
-    lists = {key: tuple(found.pop(key)) for key in ("contacts", "warnings")}
-    return Check(**found, contacts=lists["contacts"], warnings=(*lists["warnings"], *warnings))
+    lists: dict[str, Any] = {key: tuple(found.pop(key)) for key in ("contacts", "ignored", "warnings")}
+    lists["warnings"] += warnings
+    return Check(**found, **lists)
 
 
 def target(t: float, low: float, high: float) -> float:
@@ -194,7 +197,11 @@ def _mujoco(path: Path) -> Check:
     warned += [w.number for w in data.warning]
     heard += [mujoco.mjtWarning(i).name for i in np.flatnonzero(warned)]
     program = f"MuJoCo {version('mujoco')}"
-    return Check(program, len(limits), error if limits else None, tuple(sorted(contacts)), tuple(dict.fromkeys(heard)))
+    pairs = [divmod(int(signature), 1 << 16) for signature in model.exclude_signature]
+    apart = [pair for pair in pairs if all(model.body_parentid[a] != b for a, b in (pair, pair[::-1]))]
+    ignored = [" and ".join(sorted(model.body(i).name for i in pair)) for pair in apart]
+    error = error if limits else None
+    return Check(program, len(limits), error, tuple(sorted(contacts)), tuple(ignored), tuple(dict.fromkeys(heard)))
 
 
 def _pybullet(path: Path) -> Check:

@@ -1,10 +1,12 @@
 """What every simulator writer needs: the links of a twin as rigid bodies, in metres and in the export's axes."""
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
+import manifold3d
 import numpy as np
 import trimesh
 from trimesh.exchange.obj import export_obj
@@ -19,6 +21,8 @@ from hingesplat.twin import Joint, Part, Twin
 GRAVITY = 9.81
 UP = {"z": np.eye(3), "y": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
 """R_export_twin by the axis that points up in the export; twins have z up."""
+PLACES = 9
+"""Along a joint's range, where it is asked whether two links meet."""
 
 
 @dataclass(frozen=True)
@@ -65,10 +69,14 @@ class Link:
         low, high = self.joint.limits if self.joint else (0.0, 0.0)
         return low, max(high, low + 1e-4)
 
-    def pose(self, state: int) -> np.ndarray:
-        """4×4 from where the link stands in state 0 to where it stands in ``state``, export's frame."""
-        above = self.parent.pose(state) if self.parent else np.eye(4)
-        return above @ self.joint.transform(self.joint.states[state]) if self.joint else above
+    def pose(self, value: Callable[["Link"], float]) -> np.ndarray:
+        """4×4 from where the link stands in state 0 to where joint values, given by link, take it; export's frame."""
+        above = self.parent.pose(value) if self.parent else np.eye(4)
+        return above @ self.joint.transform(value(self)) if self.moves and self.joint else above
+
+    def chain(self) -> list["Link"]:
+        """The link and what it hangs from, up to the root."""
+        return [self, *(self.parent.chain() if self.parent else ())]
 
     def carries(self, other: "Link") -> bool:
         """Whether ``other`` is this link or hangs from it."""
@@ -110,38 +118,69 @@ def placement(twin: Twin, config: ExportConfig) -> tuple[np.ndarray, float]:
     return UP[config.up_axis], config.scale * twin.metres_per_unit
 
 
+def shapes(link: Link) -> list[tuple[str, str, str, trimesh.Trimesh]]:
+    """What a link shows and what it collides with: ``visual`` or ``collision``, a name, a file in the folder, the mesh.
+
+    Both in the link's frame.
+    """
+    if link.mesh is None:
+        return []
+    visual = ("visual", f"{link.name}_visual", f"meshes/{link.name}.obj", link.mesh)
+    numbered = enumerate(link.hulls)
+    hulls = [("collision", f"{link.name}_collision_{i}", f"collision/{link.name}_{i}.obj", h) for i, h in numbered]
+    return [visual, *hulls]
+
+
 def write_meshes(links: list[Link], out: Path) -> None:
-    """Write ``out/meshes/NAME.obj`` with textures and ``out/collision/NAME_NUMBER.obj``, in link frames."""
-    (out / "meshes").mkdir(parents=True, exist_ok=True)
-    (out / "collision").mkdir(exist_ok=True)
+    """Write the ``shapes`` of the links, those that are seen with textures."""
     for link in links:
-        if link.mesh is not None:
-            write_obj(link.mesh, out / "meshes" / f"{link.name}.obj")
-        for number, hull in enumerate(link.hulls):
-            write_text(out / "collision" / f"{link.name}_{number}.obj", export_obj(hull))
+        for what, _, file, mesh in shapes(link):
+            path = out / file
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if what == "visual":
+                write_obj(mesh, path)
+            else:
+                write_text(path, export_obj(mesh))
 
 
 def touching(links: list[Link]) -> list[tuple[Link, Link]]:
-    """Pairs that must not collide: parent and child, and links that touch in a state (1 % of the smaller one).
+    """Pairs that must not collide: parent and child, and links that meet somewhere in their ranges.
 
-    The thing itself stood in every state, so where its meshes touch there they are too thick.
+    The thing itself went through its ranges, so where two meshes come together there (within 1 % of the smaller one)
+    they are too thick. The way through is looked at in nine places of each of the two.
     """
-    states = range(max((len(link.joint.states) for link in links if link.joint), default=1))
-
-    def standing(link: Link, state: int) -> list[trimesh.Trimesh]:
-        placed = link.pose(state) @ trimesh.transformations.translation_matrix(link.origin)
-        return [h.copy().apply_transform(placed) for h in link.hulls]
-
-    def gap(a: Link, b: Link) -> float:
-        return 0.01 * min(float(link.mesh.extents.max()) for link in (a, b) if link.mesh is not None)
-
     return [
         (a, b)
         for a, b in combinations(links, 2)
-        if a is b.parent
-        or b is a.parent
-        or (a.hulls and b.hulls and any(near(standing(a, t), standing(b, t), gap(a, b)) for t in states))
+        if a is b.parent or b is a.parent or (a.hulls and b.hulls and _meet(a, b))
     ]
+
+
+def _meet(a: Link, b: Link) -> bool:
+    gap = 0.01 * min(float(link.mesh.extents.max()) for link in (a, b) if link.mesh is not None)
+    above = [set(map(id, link.chain())) for link in (a, b)]
+    states = range(max((len(link.joint.states) for link in (a, b) if link.joint), default=1))
+    hulls = [[manifold3d.Manifold.hull_points(np.asarray(h.vertices)) for h in link.hulls] for link in (a, b)]
+
+    def placed(link: Link, value: Callable[[Link], float]) -> list[manifold3d.Manifold]:
+        T = link.pose(value) @ trimesh.transformations.translation_matrix(link.origin)
+        return [h.transform(T[:3]) for h in hulls[link is b]]
+
+    def through(link: Link, own: set[int]) -> list[list[manifold3d.Manifold]]:
+        """The link along its way, all its own joints together; those that carry both links rest."""
+
+        def share(w: float) -> Callable[[Link], float]:
+            return lambda k: k.limits[0] + w * (k.limits[1] - k.limits[0]) if id(k) in own else 0.0
+
+        return [placed(link, share(w)) for w in (np.linspace(0, 1, PLACES) if id(link) in own else (0.0,))]
+
+    def together(state: int) -> bool:
+        at = [placed(link, lambda k: k.joint.states[state] if k.joint else 0.0) for link in (a, b)]
+        return near(at[0], at[1], gap)
+
+    return any(map(together, states)) or any(
+        near(p, q, gap) for p in through(a, above[0] - above[1]) for q in through(b, above[1] - above[0])
+    )
 
 
 def axis_load(link: Link, links: list[Link]) -> tuple[float, float]:

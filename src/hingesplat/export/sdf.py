@@ -4,7 +4,7 @@ from pathlib import Path
 
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
-from hingesplat.export.links import Link, joint_dynamics, numbers, write_meshes
+from hingesplat.export.links import Link, joint_dynamics, numbers, shapes, write_meshes
 from hingesplat.files import write_text
 
 VERSION = "1.7"
@@ -51,16 +51,9 @@ def _add_link(model: etree._Element, link: Link) -> None:
     inertia = etree.SubElement(inertial, "inertia")
     for name, moment in link.moments.items():
         _add(inertia, name, moment)
-    if link.mesh is None:
-        return
-    _add_mesh(etree.SubElement(element, "visual", name=f"{link.name}_visual"), f"meshes/{link.name}.obj")
-    for i in range(len(link.hulls)):
-        collision = etree.SubElement(element, "collision", name=f"{link.name}_collision_{i}")
-        _add_mesh(collision, f"collision/{link.name}_{i}.obj")
-
-
-def _add_mesh(element: etree._Element, uri: str) -> None:
-    _add(etree.SubElement(etree.SubElement(element, "geometry"), "mesh"), "uri", uri)
+    for what, name, file, _ in shapes(link):
+        geometry = etree.SubElement(etree.SubElement(element, what, name=name), "geometry")
+        _add(etree.SubElement(geometry, "mesh"), "uri", file)
 
 
 def _add_joint(model: etree._Element, link: Link, links: list[Link]) -> None:

@@ -76,7 +76,7 @@ def collision_hulls(mesh: trimesh.Trimesh, cache: Path, *, most: int = 12) -> tu
     key = hashlib.sha256(vertices.tobytes() + faces.tobytes() + bytes([most])).hexdigest()[:16]
     file = cache / f"{key}.npz"
     with suppress(OSError, ValueError, EOFError), np.load(file, allow_pickle=False) as data:
-        return tuple(trimesh.convex.convex_hull(data[name]) for name in sorted(data.files))
+        return tuple(_as_trimesh(manifold3d.Manifold.hull_points(data[name])) for name in sorted(data.files))
     coarse = _as_trimesh(_coarse(mesh))
     coacd.set_log_level("error")
     try:
@@ -91,16 +91,17 @@ def collision_hulls(mesh: trimesh.Trimesh, cache: Path, *, most: int = 12) -> tu
             mcts_max_depth=1,
             seed=0,
         )
-        hulls = [trimesh.convex.convex_hull(points) for points, _ in pieces]
+        least = 1e-9 * np.ptp(vertices, axis=0).max() ** 3  # Some pieces are flat.
+        solids = [manifold3d.Manifold.hull_points(np.asarray(points)) for points, _ in pieces]
+        hulls = [_as_trimesh(solid) for solid in solids if solid.volume() > least]
     except (RuntimeError, ValueError, AssertionError) as e:
         log.warning("convex decomposition failed (%s); the convex hull stands in", e)
         hulls = []
-    hulls = [h for h in hulls if h.is_watertight and h.volume > 1e-9 * np.ptp(vertices, axis=0).max() ** 3]
     hulls = hulls or [mesh.convex_hull]
     with suppress(OSError):  # A folder that cannot be written costs only time.
         cache.mkdir(parents=True, exist_ok=True)
         with whole_file(file) as tmp, tmp.open("wb") as opened:  # Given a name, savez would add a suffix.
-            np.savez(opened, **{f"{i:03d}": h.vertices for i, h in enumerate(hulls)})
+            np.savez(opened, allow_pickle=False, **{f"{i:03d}": h.vertices for i, h in enumerate(hulls)})
     return tuple(hulls)
 
 
@@ -151,10 +152,13 @@ def free_range(
     return reach(limits[0], min(most[0], limits[0])), reach(limits[1], max(most[1], limits[1]))
 
 
-def near(a: Sequence[trimesh.Trimesh], b: Sequence[trimesh.Trimesh], gap: float) -> bool:
-    """Whether a convex piece of one comes nearer than ``gap`` to one of the other."""
-    solids = [[manifold3d.Manifold.hull_points(np.asarray(h.vertices)) for h in hulls] for hulls in (a, b)]
-    return any(p.min_gap(q, gap) < gap for p in solids[0] for q in solids[1])
+def near(a: Sequence[manifold3d.Manifold], b: Sequence[manifold3d.Manifold], gap: float) -> bool:
+    """Whether a piece of one comes nearer than ``gap`` to one of the other."""
+    boxes = [np.array([p.bounding_box() for p in pieces]) for pieces in (a, b)]
+    low, high = (box[:, :3] for box in boxes), (box[:, 3:] for box in boxes)
+    (low_a, low_b), (high_a, high_b) = low, high
+    close = ((low_a[:, None] - gap < high_b) & (low_b - gap < high_a[:, None])).all(-1)
+    return any(a[i].min_gap(b[j], gap) < gap for i, j in np.argwhere(close))
 
 
 def _coarse(mesh: trimesh.Trimesh) -> manifold3d.Manifold:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
-from hingesplat.export.links import Link, joint_dynamics, numbers, write_meshes
+from hingesplat.export.links import Link, joint_dynamics, numbers, shapes, write_meshes
 from hingesplat.files import write_text
 
 
@@ -13,7 +13,7 @@ def write_urdf(links: list[Link], out: Path) -> Path:
 
     Joint value 0 is state 0. URDF cannot exempt a part from touching the base it is hinged to, so a
     ``<mujoco>`` tag, which other programs ignore, switches contacts off in MuJoCo; use the MJCF to grasp and
-    push there.
+    push there. The tag also names the integrator with which stiff servos on light chains are stable.
 
     Returns:
         The URDF's path.
@@ -22,7 +22,7 @@ def write_urdf(links: list[Link], out: Path) -> Path:
     robot = etree.Element("robot", name="twin")
     mujoco = etree.SubElement(robot, "mujoco")
     etree.SubElement(mujoco, "compiler", strippath="false", discardvisual="false", fusestatic="false")
-    etree.SubElement(etree.SubElement(mujoco, "option"), "flag", contact="disable")
+    etree.SubElement(etree.SubElement(mujoco, "option", integrator="implicitfast"), "flag", contact="disable")
     for link in links:
         _add_link(robot, link)
     for link in links:
@@ -38,18 +38,11 @@ def _add_link(robot: etree._Element, link: Link) -> None:
     etree.SubElement(inertial, "origin", xyz=numbers(link.com), rpy="0 0 0")
     etree.SubElement(inertial, "mass", value=numbers(link.mass))
     etree.SubElement(inertial, "inertia", **{k: numbers(v) for k, v in link.moments.items()})
-    if link.mesh is None:
-        return
     # Without a material of its own, so that the mesh's texture shows: PyBullet would multiply the two.
-    _add_mesh(etree.SubElement(element, "visual", name=f"{link.name}_visual"), f"meshes/{link.name}.obj")
-    for i in range(len(link.hulls)):
-        collision = etree.SubElement(element, "collision", name=f"{link.name}_collision_{i}")
-        _add_mesh(collision, f"collision/{link.name}_{i}.obj")
-
-
-def _add_mesh(element: etree._Element, filename: str) -> None:
-    etree.SubElement(element, "origin", xyz="0 0 0", rpy="0 0 0")
-    etree.SubElement(etree.SubElement(element, "geometry"), "mesh", filename=filename)
+    for what, name, file, _ in shapes(link):
+        shape = etree.SubElement(element, what, name=name)
+        etree.SubElement(shape, "origin", xyz="0 0 0", rpy="0 0 0")
+        etree.SubElement(etree.SubElement(shape, "geometry"), "mesh", filename=file)
 
 
 def _add_joint(robot: etree._Element, link: Link, parent: Link, links: list[Link]) -> None:
