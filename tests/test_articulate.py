@@ -119,7 +119,7 @@ def test_every_term_runs_and_labels_are_hard_at_the_end(name: str) -> None:
     assert g.part.dtype == torch.int64 and set(g.part.tolist()) == {0, 1}
     assert all(bool(v.isfinite().all()) for v in vars(g).values())
     known = torch.cdist(g.means, made.gaussians.means).argmin(1)
-    assert float((g.part == made.gaussians.part[known]).float().mean()) > 0.97
+    assert float((g.part == made.gaussians.part[known]).float().mean()) > 0.95
     assert distance(found.T_state_0, made) < 1.2 * distance(off_by(made, 2.0), made)
 
 

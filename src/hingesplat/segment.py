@@ -68,7 +68,7 @@ class SegmentConfig:
     """A seed agrees with a motion that costs it less than this."""
     consensus_motions: int = 50
     """Hypotheses that are refined on all seeds that agree with them."""
-    part_cost: float = 30.0
+    part_cost: float = 36.0
     """Description length of one more part, in points (a point stands for 0.03² of the extent's square)."""
     min_part_seeds: int = 25
     """A part must own at least this many seeds."""
@@ -462,7 +462,7 @@ def segment(
 
     rows = [thin(surface.points, 2 * config.spacing * extent, rng) for surface in surfaces]
     problem = Labelling.of((surfaces[0].rows(rows[0]), surfaces[1].rows(rows[1])), extent)
-    kept = eliminate(problem.smoothed([m.T for m in chosen]), config.part_cost / 2, parts)
+    kept = eliminate(problem.smoothed([m.T for m in chosen]), config.part_cost / 6, parts)
     chosen = [chosen[k - 1] for k in kept]
     for _ in range(config.rounds):
         kept, owned = problem.solve([m.T for m in chosen], config.part_cost, parts)
