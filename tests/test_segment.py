@@ -9,35 +9,15 @@ import numpy as np
 import pytest
 
 from hingesplat.gaussians import concatenate
+from hingesplat.hypotheses import PATCH, HypothesesConfig, axis_directions, distinct, groups_to_try, registered
+from hingesplat.labelling import Labelling, eliminate, label_costs, neighbour_weights, seed_costs, softmax
+from hingesplat.pieces import reattach_fragments, split_pieces
 from hingesplat.render import render
 from hingesplat.screw import prismatic, revolute
-from hingesplat.search import Motion
-from hingesplat.segment import (
-    PATCH,
-    Labelling,
-    SegmentConfig,
-    axis_directions,
-    components,
-    distinct,
-    eliminate,
-    floating,
-    groups_to_try,
-    inverted,
-    label_costs,
-    moved,
-    neighbour_weights,
-    reattach_fragments,
-    registered,
-    seed_costs,
-    segment,
-    softmax,
-    split_pieces,
-    spread_labels,
-    survey,
-    track,
-)
+from hingesplat.search import Motion, inverted, moved
+from hingesplat.segment import SegmentConfig, floating, segment, spread_labels, survey, track
 from hingesplat.stereo import Cloud, DepthMap, StereoConfig, depth_map, stereo
-from hingesplat.surface import Surface, bounds, surface_of, thin
+from hingesplat.surface import Surface, bounds, components, surface_of, thin
 from hingesplat.visibility import FREE, HIDDEN, SURFACE, Sight, ask
 from scenes import (
     ANGLE,
@@ -55,7 +35,9 @@ from scenes import (
     scene,
 )
 
-CONFIG = SegmentConfig(sight_size=96, cells=28, seeds_per_search=40, max_seeds=400, consensus_motions=6)
+CONFIG = SegmentConfig(
+    sight_size=96, cells=28, max_seeds=400, hypotheses=HypothesesConfig(seeds_per_search=40, consensus_motions=6)
+)
 QUICK = replace(CONFIG, seeds_per_search=12, cells=16, consensus_motions=2, rounds=1)
 TURN = Motion("revolute", AXIS, PIVOT, ANGLE, 1.0)
 PULL = Motion("prismatic", FORWARD, np.zeros(3), SLIDE, 1.0)
@@ -446,7 +428,7 @@ def test_pieces_far_apart_become_parts_with_one_motion() -> None:
     everything = np.concatenate([base, first, second])
     label = np.repeat([0, 1, 1], [400, 225, 225])
     surfaces = (plain(everything), plain(np.concatenate([base, moved(everything[400:], shift.T)])))
-    motions, labels = split_pieces([shift], (label, label), surfaces, 1.0, SegmentConfig())
+    motions, labels = split_pieces([shift], (label, label), surfaces, 1.0, 25)
     assert motions == [shift, shift]
     for found in labels:
         assert (found[:400] == 0).all()
@@ -455,7 +437,7 @@ def test_pieces_far_apart_become_parts_with_one_motion() -> None:
     np.testing.assert_array_equal(labels[0], labels[1])
     near = np.concatenate([base, first, first + np.array([0.15, 0, 0])])
     joined = (plain(near), plain(np.concatenate([base, moved(near[400:], shift.T)])))
-    motions, labels = split_pieces([shift], (label, label), joined, 1.0, SegmentConfig())
+    motions, labels = split_pieces([shift], (label, label), joined, 1.0, 25)
     assert motions == [shift] and labels[0].max() == 1
 
 
@@ -476,7 +458,7 @@ def test_a_piece_seen_in_one_state_only_is_no_part() -> None:
     label = np.repeat([0, 1, 1], [400, 225, 225])
     for given, states in (((label[:625], label), surfaces), ((label, label[:625]), (surfaces[1], surfaces[0]))):
         motion = SHIFT if len(given[0]) == 625 else inverted(SHIFT)
-        motions, labels = split_pieces([motion], given, states, 1.0, SegmentConfig())
+        motions, labels = split_pieces([motion], given, states, 1.0, 25)
         assert motions == [motion]
         assert [set(found) for found in labels] == [{0, 1}, {0, 1}]
 
@@ -488,7 +470,7 @@ def test_a_piece_goes_back_to_the_part_that_it_moves_with() -> None:
     other = Motion("prismatic", np.eye(3)[0], np.zeros(3), 0.3, 1.0)
     for kin, motion, parts in ((True, replace(SHIFT, value=0.505), 2), (False, other, 3)):
         surfaces = both_states((PART, SHIFT), (stray, motion), (far, motion))
-        motions, labels = split_pieces([SHIFT, motion], (label, label), surfaces, 1.0, SegmentConfig())
+        motions, labels = split_pieces([SHIFT, motion], (label, label), surfaces, 1.0, 25)
         assert len(motions) == parts
         for found in labels:
             assert (found[400:625] == 1).all() and (found[:400] == 0).all()

@@ -6,7 +6,7 @@ positions that cross the object. Nothing is matched by appearance alone, so repe
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -253,6 +253,16 @@ class Motion:
         return revolute(self.axis, self.pivot, self.value)
 
 
+def inverted(motion: Motion) -> Motion:
+    """The way back."""
+    return replace(motion, value=-motion.value)
+
+
+def moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """Points (n, 3) under a 4×4 transform."""
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
 def scan(
     seeds: np.ndarray,
     colours: np.ndarray,
@@ -305,8 +315,7 @@ def scan(
     kept: list[Motion] = []
     ends: list[np.ndarray] = []
     for motion in found:
-        T = motion.T
-        end = seeds @ T[:3, :3].T + T[:3, 3]
+        end = moved(seeds, motion.T)
         if all(np.linalg.norm(end - e, axis=1).mean() > 3 * volume.voxel for e in ends):
             kept.append(motion)
             ends.append(end)

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from hingesplat.capture import View
@@ -12,6 +14,9 @@ from hingesplat.gaussians import SH_C0, Gaussians
 from hingesplat.register import normals_of
 from hingesplat.stereo import Cloud, DepthMap, fused, seen_through
 from hingesplat.visibility import FREE, HIDDEN, SURFACE, Sight, ask, look
+
+Labels = tuple[np.ndarray, np.ndarray]
+"""Part id of every surface point of the two states."""
 
 
 @dataclass(frozen=True)
@@ -88,3 +93,23 @@ def surface_of(
     answer = ask(surface.points, surface.colours, sight)
     views_of_it = answer[:, : HIDDEN + 1].sum(1)
     return surface.rows(np.flatnonzero((answer[:, SURFACE] >= 2) & (answer[:, FREE] <= 0.15 * views_of_it)))
+
+
+def components(points: np.ndarray, radius: float, *, bridges: bool = True) -> np.ndarray:
+    """(n,) label of the connected piece each point belongs to, neighbours being closer than ``radius``.
+
+    Without ``bridges``, points with less than half the usual number of neighbours connect nothing: each only joins
+    the nearest that has more.
+    """
+    if len(points) == 0:
+        return np.zeros(0, int)
+    tree = KDTree(points)
+    pairs = tree.query_pairs(radius, output_type="ndarray")
+    if not bridges:
+        degree = np.bincount(pairs.ravel(), minlength=len(points))
+        dense = 2 * degree >= np.median(degree)
+        distance, nearest = map(np.asarray, KDTree(points[dense]).query(points[~dense]))
+        joins = np.column_stack([np.flatnonzero(~dense), np.flatnonzero(dense)[nearest]])
+        pairs = np.concatenate([pairs[dense[pairs].all(1)], joins[distance < radius]])
+    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
+    return connected_components(graph, directed=False)[1]

@@ -1,0 +1,114 @@
+"""One part is one piece: connected pieces of labelled surface points, and what becomes of those apart."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from hingesplat.search import Motion, moved
+from hingesplat.surface import Labels, Surface, components
+
+LARGE_PIECE = 0.2
+"""A piece this large beside the largest of its part is a part of its own, not a fragment."""
+
+
+def spacing(points: np.ndarray) -> float:
+    """Median distance of points (n, 3) to their nearest neighbour; 0 for fewer than two."""
+    if len(points) < 2:
+        return 0.0
+    return float(np.median(KDTree(points).query(points, 2)[0][:, 1]))
+
+
+def split_pieces(
+    motions: Sequence[Motion],
+    owned: Labels,
+    surfaces: tuple[Surface, Surface],
+    extent: float,
+    min_points: int,
+) -> tuple[list[Motion], Labels]:
+    """One part is one piece: two large pieces far apart that share a motion become two parts with that motion.
+
+    Two doors one above the other, turned by the same angle about the same line, are such a pair.
+    """
+    owned = _rejoined(motions, owned, surfaces, extent)
+    result: list[Motion] = []
+    labels = (np.zeros_like(owned[0]), np.zeros_like(owned[1]))
+    for k, motion in enumerate(motions):
+        # Two doors edge to edge are linked by a few points at most.
+        rows, piece = _pieces(k + 1, motion.T, owned, surfaces, extent, bridges=False)
+        each = [np.bincount(p, minlength=max(int(q.max(initial=0)) for q in piece) + 1) for p in piece]
+        size = each[0] + each[1]
+        # A part is seen in both states; what is seen in one only is the inside of something.
+        large = size >= max(LARGE_PIECE * size.max(), 5 * min_points)
+        both = np.minimum(*each) >= min_points
+        large &= both
+        large[np.where(both, size, 0).argmax() if both.any() else size.argmax()] = size.max() > 0
+        for p in np.flatnonzero(large):
+            result.append(motion)
+            for s in (0, 1):
+                labels[s][rows[s][piece[s] == p]] = len(result)
+        for s in (0, 1):
+            # Small pieces stay with their motion for now; ``reattach_fragments`` judges them.
+            lost = rows[s][labels[s][rows[s]] == 0]
+            found = rows[s][labels[s][rows[s]] > 0]
+            if len(lost) and len(found):
+                points = surfaces[s].points
+                labels[s][lost] = labels[s][found][KDTree(points[found]).query(points[lost])[1]]
+    return result, labels
+
+
+def _rejoined(motions: Sequence[Motion], owned: Labels, surfaces: tuple[Surface, Surface], extent: float) -> Labels:
+    """Stray pieces go to a part that they touch and that would take them to the same place."""
+    labels = (owned[0].copy(), owned[1].copy())
+    for k, motion in enumerate(motions):
+        rows, piece = _pieces(k + 1, motion.T, owned, surfaces, extent)
+        size = np.bincount(np.concatenate(piece), minlength=1)
+        for p in np.flatnonzero((size > 0) & (np.arange(len(size)) != size.argmax())):
+            mine = [rows[s][piece[s] == p] for s in (0, 1)]
+            s = int(len(mine[1]) > len(mine[0]))
+            points = surfaces[s].points[mine[s]]
+            for j, other in enumerate(motions):
+                theirs = surfaces[s].points[owned[s] == j + 1]
+                ends = [moved(points, T if s == 0 else np.linalg.inv(T)) for T in (motion.T, other.T)]
+                alike = np.linalg.norm(ends[0] - ends[1], axis=1).mean() < 0.03 * extent
+                if j != k and alike and len(theirs) and KDTree(theirs).query(points)[0].min() < 0.03 * extent:
+                    for state in (0, 1):
+                        labels[state][mine[state]] = j + 1
+                    break
+    return labels
+
+
+def reattach_fragments(
+    T_1_0: Sequence[np.ndarray], owned: Labels, surfaces: tuple[Surface, Surface], extent: float
+) -> Labels:
+    """Small pieces apart from their part's main one go to whatever they touch: nothing floats in the air."""
+    stray = (np.zeros(len(owned[0]), bool), np.zeros(len(owned[1]), bool))
+    for k, T in enumerate([np.eye(4), *T_1_0]):
+        rows, piece = _pieces(k, T, owned, surfaces, extent)
+        size = np.bincount(np.concatenate(piece), minlength=1)
+        small = size < (size.max() if k else 0.02 * size.max())
+        for s in (0, 1):
+            stray[s][rows[s][small[piece[s]]]] = True
+    labels = (owned[0].copy(), owned[1].copy())
+    for s in (0, 1):
+        if stray[s].any() and not stray[s].all():
+            points = surfaces[s].points
+            nearest = KDTree(points[~stray[s]]).query(points[stray[s]])[1]
+            labels[s][stray[s]] = owned[s][~stray[s]][nearest]
+    return labels
+
+
+def _pieces(
+    label: int,
+    T_1_0: np.ndarray,
+    owned: Labels,
+    surfaces: tuple[Surface, Surface],
+    extent: float,
+    *,
+    bridges: bool = True,
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Rows of one part's points in each state, and the connected piece of each, both states laid over each other."""
+    rows = [np.flatnonzero(o == label) for o in owned]
+    both = np.concatenate([moved(surfaces[0].points[rows[0]], T_1_0), surfaces[1].points[rows[1]]])
+    piece = components(both, max(0.025 * extent, 2.5 * spacing(both)), bridges=bridges)
+    return rows, np.split(piece, [len(rows[0])])
