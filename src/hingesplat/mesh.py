@@ -29,7 +29,7 @@ from hingesplat.stereo import DepthMap, seen_through
 
 log = logging.getLogger(__name__)
 
-WALL, DEEP = np.float32(0.5), np.float32(0.001)
+WALL, DEEP = np.float32(2.0), np.float32(0.001)
 """How much lying just behind the part's own surface says for being inside, and lying farther behind, beside the 1 of a
 view that sees through. It takes several good views to hollow a wall, and few to see into what lies behind it."""
 HOLLOW = 0.2
