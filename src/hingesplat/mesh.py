@@ -41,7 +41,7 @@ class MeshConfig:
     """How part meshes are made."""
 
     image_size: int = 240
-    """Longest side of the depth maps, pixels."""
+    """Longest side of the depth maps, pixels, where no stereo gives them its size."""
     views: int = 48
     """Views a state at most, evenly picked."""
     resolution: int = 128
