@@ -29,7 +29,7 @@ from hingesplat.stereo import DepthMap, seen_through
 
 log = logging.getLogger(__name__)
 
-WALL, DEEP = np.float32(0.5), np.float32(0.001)
+WALL, DEEP = np.float32(2.0), np.float32(0.001)
 """How much lying just behind the part's own surface says for being inside, and lying farther behind, beside the 1 of a
 view that sees through. It takes several good views to hollow a wall, and few to see into what lies behind it."""
 HOLLOW = 0.2
@@ -41,7 +41,7 @@ class MeshConfig:
     """How part meshes are made."""
 
     image_size: int = 240
-    """Longest side of the depth maps, pixels."""
+    """Longest side of the depth maps, pixels, where no stereo gives them its size."""
     views: int = 48
     """Views a state at most, evenly picked."""
     resolution: int = 128
@@ -192,10 +192,22 @@ def close_surface(distance: np.ndarray, lower: np.ndarray, voxel: float, config:
     pieces = [p for p in pieces if p.surface_area() >= config.floater * area]
     if not pieces:
         return None
-    solid = manifold3d.Manifold.compose(pieces) if len(pieces) > 1 else pieces[0]
+    solid = _refined(manifold3d.Manifold.compose(pieces), 2.5 * voxel, config.max_triangles)
     out = solid.to_mesh()
     mesh = trimesh.Trimesh(np.asarray(out.vert_properties)[:, :3], np.asarray(out.tri_verts), process=False)
     return mesh if mesh.is_watertight and mesh.volume > 0 else None
+
+
+def _refined(solid: manifold3d.Manifold, length: float, most: int) -> manifold3d.Manifold:
+    """The same solid with edges of at most ``length``, or somewhat more to keep within ``most`` triangles.
+
+    Colours stand at vertices, and flat faces have none in their middle.
+    """
+    while (fine := solid.refine_to_length(length)).num_tri() > most:
+        length *= 1.25
+        if length > solid.surface_area() ** 0.5:
+            return solid
+    return fine
 
 
 def _close_part(views: list[DepthView], config: MeshConfig) -> tuple[trimesh.Trimesh | None, float]:
@@ -212,7 +224,7 @@ def _close_part(views: list[DepthView], config: MeshConfig) -> tuple[trimesh.Tri
     unseen = weight == 0
     solid = _solid_unseen(distance, unseen, surface, lower, voxel, config.reach * extent)
     distance[unseen] = np.where(solid, -1, 1)[unseen]
-    return close_surface(ndimage.gaussian_filter(distance, 0.5), lower, voxel, config), truncation
+    return close_surface(ndimage.gaussian_filter(distance, 0.7), lower, voxel, config), truncation
 
 
 def _solid_unseen(
