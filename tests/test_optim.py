@@ -46,6 +46,19 @@ def gradients_for(optimiser: GaussianAdam, g: torch.Generator) -> dict[str, Tens
     return {name: torch.randn(v.shape, generator=g) for name, v in optimiser.values.items()}
 
 
+def test_the_order_of_a_tensor_in_memory_does_not_matter(g: torch.Generator) -> None:
+    start, offsets = some(g), torch.randn((2, 6, 3), generator=g).permute(1, 0, 2)
+    as_it_is, in_order = (
+        GaussianAdam(start, LearningRates(), EXTENT, {"state_sh": (v, 0.1)}) for v in (offsets, offsets.contiguous())
+    )
+    for _ in range(3):
+        gradients = gradients_for(in_order, g)
+        step(as_it_is, gradients)
+        step(in_order, gradients)
+    torch.testing.assert_close(as_it_is.values["state_sh"], in_order.values["state_sh"], rtol=0, atol=0)
+    assert not torch.equal(as_it_is.values["state_sh"], offsets)
+
+
 def test_selecting_rows_and_stepping_commute(g: torch.Generator) -> None:
     start, index = some(g), torch.tensor([4, 0, 5])
     whole, few = optimiser_of(start), optimiser_of(start)

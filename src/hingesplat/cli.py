@@ -278,7 +278,7 @@ def demo_config() -> "ReconstructConfig":
     return replace(
         config,
         fit=replace(config.fit, steps=1000, start_gaussians=3000, max_gaussians=8000),
-        articulate=replace(config.articulate, steps=1500, max_gaussians=16_000),
+        articulate=replace(config.articulate, steps=1700, max_gaussians=16_000),
         mesh=replace(config.mesh, views=32, image_size=200),
     )
 

@@ -101,7 +101,7 @@ class GaussianAdam:
 
     def _set(self, values: Mapping[str, Tensor], moments: Mapping[str, Moments]) -> None:
         self.values = {name: v.contiguous().requires_grad_() for name, v in values.items()}
-        fresh = {name: Moments(torch.zeros_like(v), torch.zeros_like(v)) for name, v in values.items()}
+        fresh = {name: Moments(torch.zeros_like(v), torch.zeros_like(v)) for name, v in self.values.items()}
         self.moments = fresh | dict(moments)
 
     def __len__(self) -> int:

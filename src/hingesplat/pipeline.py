@@ -19,7 +19,7 @@ from functools import partial
 from hashlib import blake2b
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from threading import Event
+from threading import Event, Lock
 from typing import Any, Literal
 
 import numpy as np
@@ -259,7 +259,7 @@ def _fit(run: Run) -> None:
     """The states know nothing of each other: cores are better used by several fits than by several threads a fit."""
     paths = {t: run / f"fit_state{t}.safetensors" for t in range(len(run.views))}
     left = [t for t, path in paths.items() if not path.is_file()]
-    threads, stopped = torch.get_num_threads(), Event()
+    threads, stopped, one_at_a_time = torch.get_num_threads(), Event(), Lock()
     at_once = max(1, min(threads, len(left)))
 
     def fit_state(t: int) -> None:
@@ -268,7 +268,8 @@ def _fit(run: Run) -> None:
         def report(**numbers: Any) -> None:
             if stopped.is_set():
                 raise InterruptedError("another state's fit has failed")
-            run.report(stage="fit", state=t, **numbers)
+            with one_at_a_time:  # Who listens need not know of threads.
+                run.report(stage="fit", state=t, **numbers)
 
         config, seed = run.config.fit, run.config.seed
         fit(run.views[t], config, seed=seed, maps=_depth(run, t), report=report).save(paths[t])
