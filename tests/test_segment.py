@@ -10,7 +10,7 @@ import pytest
 
 from hingesplat.gaussians import concatenate
 from hingesplat.hypotheses import PATCH, HypothesesConfig, axis_directions, distinct, groups_to_try, registered
-from hingesplat.labelling import Labelling, eliminate, label_costs, neighbour_weights, seed_costs, softmax
+from hingesplat.labelling import UNEXPLAINED, Labelling, eliminate, label_costs, neighbour_weights, seed_costs, softmax
 from hingesplat.pieces import reattach_fragments, split_pieces
 from hingesplat.render import render
 from hingesplat.screw import prismatic, revolute
@@ -38,7 +38,8 @@ from scenes import (
 CONFIG = SegmentConfig(
     sight_size=96, cells=28, max_seeds=400, hypotheses=HypothesesConfig(seeds_per_search=40, consensus_motions=6)
 )
-QUICK = replace(CONFIG, seeds_per_search=12, cells=16, consensus_motions=2, rounds=1)
+FEW = HypothesesConfig(seeds_per_search=12, consensus_motions=2)
+QUICK = replace(CONFIG, cells=16, hypotheses=FEW, rounds=1)
 TURN = Motion("revolute", AXIS, PIVOT, ANGLE, 1.0)
 PULL = Motion("prismatic", FORWARD, np.zeros(3), SLIDE, 1.0)
 NO_SIGHT = Sight(
@@ -90,6 +91,17 @@ def test_components_are_the_connected_pieces() -> None:
     assert len(np.unique(components(points, 0.009))) == 450
     assert len(np.unique(components(points, 2.0))) == 1
     assert components(points[:0], 1.0).shape == (0,)
+
+
+def test_a_few_points_between_two_pieces_are_no_bridge() -> None:
+    left, right = patch((0, 0, 0)), patch((0.3, 0, 0))
+    between = np.array([[x, 0.07, 0.0] for x in np.arange(left[:, 0].max() + 0.01, right[:, 0].min(), 0.01)])
+    points = np.concatenate([left, right, between])
+    assert len(np.unique(components(points, 0.025))) == 1
+    label = components(points, 0.025, bridges=False)
+    assert len(np.unique(label[:225])) == len(np.unique(label[225:450])) == 1
+    assert label[0] != label[225]
+    assert label[450] == label[0] and label[-1] == label[225]
 
 
 def test_groups_are_pieces_and_patches_of_the_large_ones() -> None:
@@ -394,6 +406,14 @@ def test_smoothing_agrees_with_the_truth_more_than_single_points_do(turned: Turn
     assert smoothed.shape == (len(part), 3)
     single = np.concatenate(problem.costs([TURN.T, wrong.T]))
     assert (smoothed.argmin(1) == part).mean() > max((single.argmin(1) == part).mean(), 0.85)
+    assert eliminate(smoothed, PRICE, None) == [1]
+
+
+def test_no_price_is_paid_for_a_motion_that_only_hides(turned: Turned) -> None:
+    _, surfaces, extent = turned
+    into_the_box = prismatic(FORWARD, -0.5 * extent)
+    smoothed = Labelling.of(surfaces, extent).smoothed([TURN.T, into_the_box])
+    assert smoothed.max() < UNEXPLAINED + 1e-9
     assert eliminate(smoothed, PRICE, None) == [1]
 
 
