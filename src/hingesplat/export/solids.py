@@ -5,6 +5,7 @@ import logging
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import coacd
 import manifold3d
@@ -66,14 +67,26 @@ def closed_mesh(mesh: trimesh.Trimesh, name: str, max_triangles: int) -> trimesh
     return out
 
 
+DECOMPOSITION: dict[str, Any] = dict(
+    threshold=0.1,
+    preprocess_mode="off",
+    resolution=500,
+    mcts_nodes=8,
+    mcts_iterations=10,
+    mcts_max_depth=1,
+    seed=0,
+)
+"""How CoACD cuts: a look one cut ahead is a third faster than two, and its pieces fit no worse."""
+
+
 def collision_hulls(mesh: trimesh.Trimesh, cache: Path, *, most: int = 12) -> tuple[trimesh.Trimesh, ...]:
     """Convex pieces that cover a closed mesh (CoACD, seeded); its one convex hull where that fails.
 
-    ``cache`` is a folder of ``HASH.npz`` files: the same mesh is cut only once.
+    ``cache`` is a folder of ``HASH.npz`` files: the same mesh is cut only once in the same way.
     """
     vertices = np.ascontiguousarray(mesh.vertices, np.float64)
     faces = np.ascontiguousarray(mesh.faces, np.int32)
-    key = hashlib.sha256(vertices.tobytes() + faces.tobytes() + bytes([most])).hexdigest()[:16]
+    key = hashlib.sha256(vertices.tobytes() + faces.tobytes() + f"{most} {DECOMPOSITION}".encode()).hexdigest()[:16]
     file = cache / f"{key}.npz"
     with suppress(OSError, ValueError, EOFError), np.load(file, allow_pickle=False) as data:
         return tuple(_as_trimesh(manifold3d.Manifold.hull_points(data[name])) for name in sorted(data.files))
@@ -82,14 +95,8 @@ def collision_hulls(mesh: trimesh.Trimesh, cache: Path, *, most: int = 12) -> tu
     try:
         pieces = coacd.run_coacd(
             coacd.Mesh(np.asarray(coarse.vertices, np.float64), np.asarray(coarse.faces, np.int32)),
-            threshold=0.1,
             max_convex_hull=most,
-            preprocess_mode="off",
-            resolution=500,
-            mcts_nodes=8,
-            mcts_iterations=10,
-            mcts_max_depth=1,
-            seed=0,
+            **DECOMPOSITION,
         )
         least = 1e-9 * np.ptp(vertices, axis=0).max() ** 3  # Some pieces are flat.
         solids = [manifold3d.Manifold.hull_points(np.asarray(points)) for points, _ in pieces]
