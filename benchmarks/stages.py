@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import tyro
-from captures import call
 from common import machine, markdown, save, set_between
+
+from hingesplat.bench import call
 
 
 @dataclass(frozen=True)
