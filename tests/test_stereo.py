@@ -17,6 +17,7 @@ from hingesplat.stereo import (
     Picture,
     StereoConfig,
     confirmed,
+    cubes,
     depth_map,
     fused,
     measured,
@@ -332,3 +333,10 @@ def test_rows_and_joined_undo_each_other() -> None:
         np.testing.assert_array_equal(getattr(again, name), value)
     mask = np.arange(10) % 2 == 0
     np.testing.assert_array_equal(cloud.rows(mask).normals, cloud.normals[::2])
+
+
+def test_points_share_a_number_if_and_only_if_they_share_a_cube() -> None:
+    points = np.random.default_rng(0).uniform(-3, 3, (500, 3))
+    by_row = np.unique(np.floor(points / 0.7).astype(int), axis=0, return_inverse=True)[1].ravel()
+    np.testing.assert_array_equal(np.unique(cubes(points, 0.7), return_inverse=True)[1], by_row)
+    assert cubes(points[:0], 0.7).shape == (0,)

@@ -25,7 +25,7 @@ from hingesplat.gaussians import SH_C0, Gaussians, posed
 from hingesplat.render import rasterize
 from hingesplat.se3 import wxyz_to_matrix
 from hingesplat.simd import parallel
-from hingesplat.stereo import DepthMap, seen_through
+from hingesplat.stereo import DepthMap, cubes, seen_through
 
 log = logging.getLogger(__name__)
 
@@ -394,9 +394,8 @@ def _surface_points(views: Sequence[DepthView], resolution: int) -> np.ndarray:
     if len(points) < 16:
         return points[:0]
     size = float((np.quantile(points, 0.99, axis=0) - np.quantile(points, 0.01, axis=0)).max()) / resolution
-    cells = np.floor(points / max(size, 1e-9)).astype(np.int64)
-    _, cell, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    mean = np.stack([np.bincount(cell.ravel(), a) for a in points.T], 1) / count[:, None]
+    _, cell, count = np.unique(cubes(points, max(size, 1e-9)), return_inverse=True, return_counts=True)
+    mean = np.stack([np.bincount(cell, a) for a in points.T], 1) / count[:, None]
     mean = mean[count >= 3]
     if len(mean) < 16:
         return mean[:0]

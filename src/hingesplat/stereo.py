@@ -146,13 +146,19 @@ def fused(maps: Sequence[DepthMap], size: float) -> Cloud:
     seen = [m.points() for m in maps]
     points, colours = (np.concatenate(p) for p in zip(*seen, strict=True))
     towards = np.concatenate([m.camera.centre - p for m, (p, _) in zip(maps, seen, strict=True)])
-    cells = np.floor(points / size).astype(np.int64)
-    _, cell, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    columns = [np.bincount(cell.ravel(), a) for a in (*points.T, *colours.T, *towards.T)]
+    _, cell, count = np.unique(cubes(points, size), return_inverse=True, return_counts=True)
+    columns = [np.bincount(cell, a) for a in (*points.T, *colours.T, *towards.T)]
     mean = (np.stack(columns, 1) / count[:, None])[count >= 2]
     normals = normals_by_neighbours(mean[:, :3])
     normals *= np.where((normals * mean[:, 6:]).sum(1, keepdims=True) < 0, -1, 1)
     return Cloud(mean[:, :3], normals, mean[:, 3:6])
+
+
+def cubes(points: np.ndarray, size: float) -> np.ndarray:
+    """(n,) int64: a number for the cube of edge ``size`` that each point (n, 3) lies in, the same for no two cubes."""
+    cell = np.floor(points / size).astype(np.int64)
+    cell -= cell.min(0, initial=0)
+    return np.asarray(np.ravel_multi_index(tuple(cell.T), tuple(cell.max(0, initial=0) + 1)))
 
 
 def normals_by_neighbours(points: np.ndarray, k: int = 12) -> np.ndarray:

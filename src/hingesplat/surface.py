@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from hingesplat.capture import View
 from hingesplat.gaussians import SH_C0, Gaussians
 from hingesplat.register import normals_of
-from hingesplat.stereo import Cloud, DepthMap, fused, seen_through
+from hingesplat.stereo import Cloud, DepthMap, cubes, fused, seen_through
 from hingesplat.visibility import FREE, HIDDEN, SURFACE, Sight, ask, look
 
 Labels = tuple[np.ndarray, np.ndarray]
@@ -66,7 +66,7 @@ def bounds(surfaces: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 def thin(points: np.ndarray, size: float, rng: np.random.Generator) -> np.ndarray:
     """Indices of one random point in each occupied cube of the given size, so that area counts, not texture."""
     order = rng.permutation(len(points))
-    _, first = np.unique(np.floor(points[order] / size).astype(np.int64), axis=0, return_index=True)
+    _, first = np.unique(cubes(points[order], size), return_index=True)
     return order[rng.permutation(first)]
 
 
