@@ -39,7 +39,7 @@ class SegmentConfig:
     """Seeds of each state that judge the hypotheses."""
     explained_cost: float = 0.8
     """A seed that a motion explains worse than this counts as unexplained."""
-    part_cost: float = 36.0
+    part_cost: float = 45.0
     """Description length of one more part, in points (a point stands for 0.03² of the extent's square)."""
     min_part_seeds: int = 25
     """A part must own at least this many seeds."""
@@ -140,7 +140,7 @@ def segment(
 
     rows = [thin(surface.points, 2 * config.spacing * extent, rng) for surface in surfaces]
     problem = Labelling.of((surfaces[0].rows(rows[0]), surfaces[1].rows(rows[1])), extent)
-    kept = eliminate(problem.smoothed([m.T for m in chosen]), config.part_cost / 6, parts)
+    kept = eliminate(problem.smoothed([m.T for m in chosen]), config.part_cost / 3, parts)
     chosen = [chosen[k - 1] for k in kept]
     for _ in range(config.rounds):
         kept, owned = problem.solve([m.T for m in chosen], config.part_cost, parts)
