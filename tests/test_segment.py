@@ -14,7 +14,8 @@ from hingesplat.labelling import UNEXPLAINED, Labelling, eliminate, label_costs,
 from hingesplat.pieces import reattach_fragments, split_pieces
 from hingesplat.render import render
 from hingesplat.screw import prismatic, revolute
-from hingesplat.search import Motion, inverted, moved
+from hingesplat.se3 import moved
+from hingesplat.search import Motion, inverted
 from hingesplat.segment import SegmentConfig, floating, segment, spread_labels, survey, track
 from hingesplat.stereo import Cloud, DepthMap, StereoConfig, depth_map, stereo
 from hingesplat.surface import Surface, bounds, components, surface_of, thin

@@ -9,7 +9,8 @@ from scipy.cluster.vq import kmeans2
 from hingesplat.labelling import seed_costs
 from hingesplat.register import register
 from hingesplat.screw import matrix_to_screw
-from hingesplat.search import Motion, ScoreVolume, inverted, moved, scan
+from hingesplat.se3 import moved
+from hingesplat.search import Motion, ScoreVolume, inverted, scan
 from hingesplat.stereo import Cloud
 from hingesplat.surface import Surface, components
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.sparse import csr_matrix, identity
 from scipy.spatial import KDTree
 
-from hingesplat.search import moved
+from hingesplat.se3 import moved
 from hingesplat.surface import Labels, Surface, free_share
 from hingesplat.visibility import COLOUR, SURFACE, Sight, ask
 

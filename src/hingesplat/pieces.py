@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import KDTree
 
-from hingesplat.search import Motion, moved
+from hingesplat.se3 import moved
+from hingesplat.search import Motion
 from hingesplat.surface import Labels, Surface, components
 
 LARGE_PIECE = 0.2

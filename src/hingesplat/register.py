@@ -5,7 +5,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from hingesplat.gaussians import Gaussians
-from hingesplat.se3 import wxyz_to_matrix
+from hingesplat.se3 import moved, wxyz_to_matrix
 from hingesplat.stereo import Cloud
 
 COLOUR_LENGTH = 0.08
@@ -18,7 +18,7 @@ def features(cloud: Cloud, T: np.ndarray, extent: float) -> np.ndarray:
     """(n, 9) what has to be alike for two points to be one, after T: place, colour, side of the sheet."""
     return np.concatenate(
         [
-            cloud.points @ T[:3, :3].T + T[:3, 3],
+            moved(cloud.points, T),
             cloud.colours * (COLOUR_LENGTH * extent),
             cloud.normals @ T[:3, :3].T * (NORMAL_LENGTH * extent),
         ],
@@ -53,12 +53,12 @@ def register(
     tree = KDTree(features(target, np.eye(4), extent))
     for i in range(iterations):
         radius = extent * start_radius * (end_radius / start_radius) ** (i / max(iterations - 1, 1))
-        moved = features(source, T, extent)
-        distance, index = map(np.asarray, tree.query(moved))
+        ours = features(source, T, extent)
+        distance, index = map(np.asarray, tree.query(ours))
         near = distance < radius
         if near.sum() < 12:
             return T
-        p, q, n = moved[near, :3], target.points[index[near]], target.normals[index[near]]
+        p, q, n = ours[near, :3], target.points[index[near]], target.normals[index[near]]
         centre = p.mean(0)
         arm = p - centre
         rows, residuals = [], []

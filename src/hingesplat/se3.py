@@ -1,5 +1,6 @@
 """Rigid transforms as 4×4 matrices and quaternions wxyz; thin names over roma, whose own order is xyzw."""
 
+import numpy as np
 import roma
 import torch
 from torch import Tensor
@@ -58,3 +59,8 @@ def inverse(T: Tensor) -> Tensor:
 def apply(T_b_a: Tensor, points_a: Tensor) -> Tensor:
     """Points (n, 3) in frame a to frame b; one transform (4, 4), or one a point (n, 4, 4)."""
     return (T_b_a[..., :3, :3] @ points_a[..., None])[..., 0] + T_b_a[..., :3, 3]
+
+
+def moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """NumPy points (n, 3) under a 4×4 transform."""
+    return points @ T[:3, :3].T + T[:3, 3]

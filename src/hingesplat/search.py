@@ -15,6 +15,7 @@ from numba import njit
 from scipy.ndimage import distance_transform_edt
 
 from hingesplat.screw import prismatic, revolute
+from hingesplat.se3 import moved
 from hingesplat.simd import parallel
 from hingesplat.visibility import FREE, SURFACE, Sight, ask
 
@@ -256,11 +257,6 @@ class Motion:
 def inverted(motion: Motion) -> Motion:
     """The way back."""
     return replace(motion, value=-motion.value)
-
-
-def moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
-    """Points (n, 3) under a 4×4 transform."""
-    return points @ T[:3, :3].T + T[:3, 3]
 
 
 def scan(

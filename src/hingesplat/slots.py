@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
+from hingesplat.se3 import moved
+
 
 @dataclass(frozen=True)
 class SlotsConfig:
@@ -52,7 +54,7 @@ def living_slots(
 def _apart(points: np.ndarray, T: np.ndarray, other: np.ndarray) -> float:
     """Mean distance between where two motions (states, 4, 4) take the points, in the state where it is largest."""
     off = T - other
-    return float(max(np.linalg.norm(points @ M[:3, :3].T + M[:3, 3], axis=1).mean() for M in off))
+    return float(max(np.linalg.norm(moved(points, M), axis=1).mean() for M in off))
 
 
 def _touch(points: np.ndarray, other: np.ndarray, extent: float) -> bool:
