@@ -5,9 +5,10 @@ A point's cost under a motion is what the other state's photographs say of the p
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
-from scipy.sparse import csr_matrix, identity
+from scipy.sparse import csr_matrix
 from scipy.spatial import KDTree
 
 from hingesplat.se3 import moved
@@ -16,10 +17,13 @@ from hingesplat.visibility import COLOUR, SURFACE, Sight, ask
 
 ARRIVED = 4
 """Views that must see a surface where a motion takes a point, for the point to have been seen there."""
-UNEXPLAINED = 0.35
-"""What a point costs at most when motions are chosen: a little more than one that a motion hides."""
 HIDDEN_SEED_COST = 0.4
 """Cost of a seed that a motion takes out of everybody's sight."""
+NOBODY = 0.3
+"""What a point without a partner in the other state hears from it, between a partner that disagrees (0) and one that
+agrees (1)."""
+PROMISING, EXCHANGED = 10, 6
+"""Motions that each round of a choice tries to add, and to exchange for one that is there."""
 
 
 def label_costs(
@@ -29,11 +33,13 @@ def label_costs(
     *,
     extent: float,
     hidden_cost: float = 0.25,
+    covered_cost: float = 0.15,
     far_cost: float = 0.3,
 ) -> np.ndarray:
     """(n, 1 + transforms) cost of each label for each surface point, from the other state's photographs alone.
 
-    Label 0 is to stay; label k + 1 is to move by ``transforms[k]``, 4×4 from the surface's state to the other.
+    Label 0 is to stay; label k + 1 is to move by ``transforms[k]``, 4×4 from the surface's state to the other. Who
+    moves out of everybody's sight costs ``hidden_cost``; who stays and is covered by something that moves, less.
     """
     columns = []
     for T in [None, *transforms]:
@@ -47,7 +53,8 @@ def label_costs(
         # To move is a claim: it costs a little, and to be recognised far away costs more.
         way = np.linalg.norm(points - surface.points, axis=1) / extent
         claim = 0.0 if T is None else 0.05 + far_cost * way * arrived
-        columns.append(contradiction + arrived * 0.5 * colour + (1 - arrived) * hidden_cost + claim)
+        unseen = covered_cost if T is None else hidden_cost
+        columns.append(contradiction + arrived * 0.5 * colour + (1 - arrived) * unseen + claim)
     return np.stack(columns, 1)
 
 
@@ -124,7 +131,7 @@ class Labelling:
             for s in (0, 1):
                 support = self.smoothness * (self.weights[s] @ q[s])
                 partner = q[1 - s][np.maximum(partners[s], 0), label]
-                meeting = self.consistency * np.where(partners[s] >= 0, partner, 0.3)
+                meeting = self.consistency * np.where(partners[s] >= 0, partner, NOBODY)
                 total = costs[s] - support - meeting
                 updated.append(softmax(-total / temperature))
                 # Each edge is heard from both its ends, so pairs count half.
@@ -132,78 +139,66 @@ class Labelling:
             q = updated
         return (q[0].argmax(1), q[1].argmax(1)), energy
 
-    def smoothed(self, T_1_0: Sequence[np.ndarray]) -> np.ndarray:
-        """(points of both states, 1 + motions) costs, each the mean over a point and its neighbours.
-
-        A point that a motion brings onto a surface asks that surface, too, how much it would rather be another's.
-        None costs more than ``UNEXPLAINED``: else a motion would pay that only takes what nothing explains out of
-        sight.
-        """
-        costs, partners = self.costs(T_1_0), self.partners(T_1_0)
-        result = []
-        for s in (0, 1):
-            regret = costs[1 - s] - costs[1 - s].min(1, keepdims=True)
-            there = np.take_along_axis(regret, np.maximum(partners[s], 0), 0)
-            both = np.minimum(costs[s] + np.where(partners[s] >= 0, 0.5 * there, 0), UNEXPLAINED)
-            average = self.weights[s] + identity(len(both))
-            average = average.multiply(1 / average.sum(1)).tocsr()
-            result.append(average @ (average @ both))
-        return np.concatenate(result)
-
     def labels(self, T_1_0: Sequence[np.ndarray]) -> Labels:
         """Labels of both states' points under these motions, all of which stay."""
         return self.mean_field(self.costs(T_1_0), self.partners(T_1_0))[0]
 
-    def solve(self, T_1_0: Sequence[np.ndarray], part_cost: float, parts: int | None) -> tuple[list[int], Labels]:
-        """Drop motions one by one as long as doing without costs less than a part.
+    def choose(self, T_1_0: Sequence[np.ndarray], part_cost: float, parts: int | None) -> tuple[list[int], Labels]:
+        """The motions that explain both states at the least description length: energy and a price for each.
+
+        Motions are added, dropped and exchanged as long as that shortens it. That two points meet counts, so a
+        motion that explains a surface of one state by one that another motion explains already gains little.
+
+        Args:
+            T_1_0: motions to choose from.
+            part_cost: the price of each.
+            parts: choose this many instead, as far as there are.
 
         Returns:
-            The indices of the motions that stay, and labels that count them from 1.
+            The indices of the motions chosen, and labels that count them from 1.
         """
         costs, partners = self.costs(T_1_0), self.partners(T_1_0)
-        columns = list(range(len(T_1_0) + 1))
 
-        def run(keep: list[int], iterations: int) -> tuple[Labels, float]:
-            return self.mean_field([c[:, keep] for c in costs], [p[:, keep] for p in partners], iterations)
+        @cache
+        def solved(kept: frozenset[int]) -> tuple[Labels, float]:
+            columns = np.array([0, *sorted(kept)])
+            labels, energy = self.mean_field([c[:, columns] for c in costs], [p[:, columns] for p in partners], 8)
+            price = part_cost * len(kept) if parts is None else sum(map(len, costs)) * abs(len(kept) - parts)
+            return (columns[labels[0]], columns[labels[1]]), energy + price
 
-        while len(columns) > 1 and (parts is None or len(columns) - 1 > parts):
-            energy = run(columns, 8)[1]
-            trials = {k: run([c for c in columns if c != k], 8)[1] for k in columns[1:]}
-            worst = min(trials, key=lambda k: trials[k])
-            if parts is None and trials[worst] - energy > part_cost:
-                break
-            columns.remove(worst)
-        return [k - 1 for k in columns[1:]], run(columns, 20)[0]
+        def length(kept: frozenset[int]) -> float:
+            return solved(kept)[1]
 
+        kept: frozenset[int] = frozenset()
+        while True:
+            others = [k for k in self.promising(costs, partners, solved(kept)[0]) if k not in kept]
+            smaller = [kept - {k} for k in sorted(kept)]
+            changed = smaller + [kept | {k} for k in others[:PROMISING]]
+            # Exchanges are many: they have their turn when nothing else helps.
+            exchanged = [less | {k} for less in smaller for k in others[:EXCHANGED]]
+            for trials in (changed, exchanged):
+                best = min(trials, key=length, default=kept)
+                if length(best) < length(kept) - 1:
+                    kept = best
+                    break
+            else:
+                columns = [0, *sorted(kept)]
+                first, second = (np.searchsorted(columns, labels) for labels in solved(kept)[0])
+                return [k - 1 for k in columns[1:]], (first, second)
 
-def eliminate(costs: np.ndarray, price: float, parts: int | None) -> list[int]:
-    """The fewest labels (columns) that explain the points (rows) at the least description length.
-
-    All are there at first; the one that is missed least goes, until every one is worth its price or ``parts`` are
-    left. Column 0, to stay, is free and stays. Two motions that are right together thus beat one that is nearly
-    right for both, which a greedy choice would take first.
-    """
-    kept = list(range(costs.shape[1]))
-    while len(kept) > 1 and (parts is None or len(kept) - 1 > parts):
-        best = np.argpartition(costs[:, kept], 1, axis=1)
-        first, second = (np.take_along_axis(costs[:, kept], best[:, [i]], 1)[:, 0] for i in (0, 1))
-        missed = np.bincount(best[:, 0], second - first, minlength=len(kept))
-        missed[0] = np.inf
-        least = int(missed.argmin())
-        if parts is None and missed[least] > price:
-            break
-        kept.pop(least)
-    while True:  # Another one for one of these, as long as that explains more.
-        trials = []
-        for i in range(1, len(kept)):
-            rest = costs[:, kept[:i] + kept[i + 1 :]].min(1)
-            energy = np.minimum(costs, rest[:, None]).sum(0)
-            trials.append((float(energy.min()), i, int(energy.argmin())))
-        now = costs[:, kept].min(1).sum()
-        if not trials or min(trials)[0] > now - 1:
-            return kept[1:]
-        _, i, better = min(trials)
-        kept[i] = better
+    def promising(self, costs: list[np.ndarray], partners: list[np.ndarray], labels: Labels) -> list[int]:
+        """Labels (columns) but the first, those first that the points would gain most by if their partners agreed."""
+        gain = np.zeros(costs[0].shape[1])
+        for s in (0, 1):
+            row, label = np.arange(len(labels[s])), labels[s]
+            met = partners[s] >= 0
+            agree = np.where(met[row, label], labels[1 - s][partners[s][row, label]] == label, NOBODY)
+            now = costs[s][row, label] - 0.5 * self.consistency * agree
+            then = costs[s] - 0.5 * self.consistency * np.where(met, 1.0, NOBODY)
+            better = now[:, None] - then
+            average = (self.weights[s] @ better + better) / (1 + self.weights[s].sum(1))
+            gain += np.maximum(np.asarray(average), 0).sum(0)
+        return [int(k) for k in np.argsort(-gain) if k > 0]
 
 
 def softmax(x: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 from hingesplat.capture import View
 from hingesplat.gaussians import Gaussians
 from hingesplat.hypotheses import HypothesesConfig, consensus, distinct, polished, propose, refit
-from hingesplat.labelling import Labelling, eliminate, seed_costs
+from hingesplat.labelling import Labelling, seed_costs
 from hingesplat.pieces import reattach_fragments, split_pieces
 from hingesplat.search import Motion, ScoreVolume, inverted, novelty, scan, score_volume
 from hingesplat.stereo import DepthMap
@@ -140,10 +140,8 @@ def segment(
 
     rows = [thin(surface.points, 2 * config.spacing * extent, rng) for surface in surfaces]
     problem = Labelling.of((surfaces[0].rows(rows[0]), surfaces[1].rows(rows[1])), extent)
-    kept = eliminate(problem.smoothed([m.T for m in chosen]), config.part_cost / 3, parts)
-    chosen = [chosen[k - 1] for k in kept]
     for _ in range(config.rounds):
-        kept, owned = problem.solve([m.T for m in chosen], config.part_cost, parts)
+        kept, owned = problem.choose([m.T for m in chosen], config.part_cost, parts)
         chosen = [
             refit(
                 chosen[k],
@@ -218,9 +216,6 @@ def track(
 def spread_labels(points: np.ndarray, surface: Surface, labels: np.ndarray) -> np.ndarray:
     """(n,) labels for all Gaussians at points (n, 3): each takes its nearest surface point's."""
     return labels[KDTree(surface.points).query(points)[1]]
-
-
-__all__ = ["SegmentConfig", "Segmentation", "segment", "track"]
 
 
 __all__ = ["SegmentConfig", "Segmentation", "segment", "track"]
