@@ -10,7 +10,7 @@ import pytest
 
 from hingesplat.gaussians import concatenate
 from hingesplat.hypotheses import PATCH, HypothesesConfig, axis_directions, distinct, groups_to_try, registered
-from hingesplat.labelling import UNEXPLAINED, Labelling, eliminate, label_costs, neighbour_weights, seed_costs, softmax
+from hingesplat.labelling import Labelling, label_costs, neighbour_weights, seed_costs, shortest, softmax
 from hingesplat.pieces import reattach_fragments, split_pieces
 from hingesplat.render import render
 from hingesplat.screw import prismatic, revolute
@@ -200,6 +200,20 @@ def with_compromise(costs: np.ndarray) -> np.ndarray:
     return np.insert(costs, 1, np.where(moves, 0.35, 1.1), axis=1)
 
 
+def chosen(costs: np.ndarray, price: float, parts: int | None = None) -> list[int]:
+    """The columns that ``shortest`` takes, the first aside, each point taking the cheapest."""
+
+    def length(kept: frozenset[int]) -> float:
+        own = costs[:, [0, *sorted(kept)]].min(1).sum()
+        return own + (price * len(kept) if parts is None else 1e6 * abs(len(kept) - parts))
+
+    def promising(kept: frozenset[int]) -> list[int]:
+        gain = np.maximum(costs[:, [0, *sorted(kept)]].min(1)[:, None] - costs, 0).sum(0)
+        return [int(k) for k in np.argsort(-gain) if k > 0]
+
+    return sorted(shortest(length, promising))
+
+
 def greedy(costs: np.ndarray, price: float) -> list[int]:
     """The motion that helps most, then the next, as long as it pays."""
     best, chosen = costs[:, 0], []
@@ -212,7 +226,7 @@ def greedy(costs: np.ndarray, price: float) -> list[int]:
 def test_two_right_motions_beat_one_that_is_nearly_right_for_both() -> None:
     costs = with_compromise(costs_of(300, 150, 150))
     assert greedy(costs, PRICE) == [1]
-    assert sorted(eliminate(costs, PRICE, None)) == [2, 3]
+    assert chosen(costs, PRICE) == [2, 3]
 
 
 def test_generating_motions_are_found_among_many(rng: np.random.Generator) -> None:
@@ -220,36 +234,36 @@ def test_generating_motions_are_found_among_many(rng: np.random.Generator) -> No
     worse = true[:, [1, 2, 3, 1, 2]] + 0.15
     lucky = np.where(rng.random((len(true), 20)) < 0.2, 0.2, 1.1)
     costs = np.concatenate([with_compromise(true), worse, lucky], 1) + rng.uniform(0, 0.05, (len(true), 30))
-    assert sorted(eliminate(costs, PRICE, None)) == [2, 3, 4]
+    assert chosen(costs, PRICE) == [2, 3, 4]
 
 
 def test_a_motion_must_be_worth_its_price() -> None:
     costs = costs_of(100, 200, 80)
-    for price, chosen in ((10, [1, 2]), (79, [1, 2]), (81, [1]), (199, [1]), (201, [])):
-        assert sorted(eliminate(costs, price, None)) == chosen, price
+    for price, worth in ((10, [1, 2]), (78, [1, 2]), (82, [1]), (198, [1]), (202, [])):
+        assert chosen(costs, price) == worth, price
 
 
 @pytest.mark.parametrize("parts", [0, 1, 2, 3])
 def test_as_many_motions_as_were_asked_for(parts: int) -> None:
     costs = costs_of(100, 400, 200, 100)
-    for price in (0, 1e6):
-        assert sorted(eliminate(costs, price, parts)) == list(range(1, parts + 1))
+    assert chosen(costs, 0, parts) == list(range(1, parts + 1))
 
 
 def test_to_stay_is_free() -> None:
     """It costs no part, so it is there at any price and even if it is missed least."""
-    assert eliminate(costs_of(300, 30), PRICE, None) == []
-    assert eliminate(costs_of(0, 90, 90), PRICE, 2) == [1, 2]
-    assert eliminate(costs_of(1, 90, 80), PRICE, 1) == [1]
+    assert chosen(costs_of(300, 30), PRICE) == []
+    assert chosen(costs_of(0, 90, 90), PRICE, 2) == [1, 2]
+    assert chosen(costs_of(1, 90, 80), PRICE, 1) == [1]
     base_only = np.column_stack([np.zeros(100), np.zeros(100), np.full(100, 0.2)])
-    assert eliminate(base_only, 1.0, None) == []
+    assert chosen(base_only, 1.0) == []
 
 
-def test_what_was_dropped_too_early_comes_back() -> None:
-    """The compromise is the first to go while both exact motions are there, and the better one for one part only."""
+def test_a_better_one_takes_the_place_of_another() -> None:
+    """With one motion only the compromise is best, though an exact one is the more promising."""
     costs = with_compromise(costs_of(300, 150, 150))
-    assert eliminate(costs, PRICE, 1) == [1]
-    assert costs[:, [0, 1]].min(1).sum() < min(costs[:, [0, k]].min(1).sum() for k in (2, 3))
+    exact_first = lambda kept: [2, 3, 1]  # noqa: E731
+    length = lambda kept: costs[:, [0, *sorted(kept)]].min(1).sum() + 1e6 * abs(len(kept) - 1)  # noqa: E731
+    assert shortest(length, exact_first) == {1}
 
 
 # Labels.
@@ -388,34 +402,20 @@ def test_labels_follow_the_motions_and_a_false_one_is_dropped(
     made, surfaces, extent = turned
     problem = Labelling.of(surfaces, extent)
     false = Motion("revolute", np.eye(3)[0], np.zeros(3), 1.5, 1.0)
-    kept, labels = problem.solve([false.T, TURN.T], 20.0, None)
+    kept, labels = problem.choose([false.T, TURN.T], 20.0, None)
     assert kept == [1]
     for s in (0, 1):
         part = parts_of(made, surfaces[s], s)
         assert (labels[s] == part).mean() > 0.92
         assert (problem.labels([TURN.T])[s] == labels[s]).all()
-    assert problem.solve([false.T, TURN.T], 20.0, 2)[0] == [0, 1]
-    assert problem.solve([false.T, TURN.T], 20.0, 0)[0] == []
-
-
-def test_smoothing_agrees_with_the_truth_more_than_single_points_do(turned: Turned) -> None:
-    made, surfaces, extent = turned
-    problem = Labelling.of(surfaces, extent)
-    wrong = replace(TURN, value=-ANGLE)
-    smoothed = problem.smoothed([TURN.T, wrong.T])
-    part = np.concatenate([parts_of(made, surface, s) for s, surface in enumerate(surfaces)])
-    assert smoothed.shape == (len(part), 3)
-    single = np.concatenate(problem.costs([TURN.T, wrong.T]))
-    assert (smoothed.argmin(1) == part).mean() > max((single.argmin(1) == part).mean(), 0.85)
-    assert eliminate(smoothed, PRICE, None) == [1]
+    assert problem.choose([false.T, TURN.T], 20.0, 2)[0] == [0, 1]
+    assert problem.choose([false.T, TURN.T], 20.0, 0)[0] == []
 
 
 def test_no_price_is_paid_for_a_motion_that_only_hides(turned: Turned) -> None:
     _, surfaces, extent = turned
     into_the_box = prismatic(FORWARD, -0.5 * extent)
-    smoothed = Labelling.of(surfaces, extent).smoothed([TURN.T, into_the_box])
-    assert smoothed.max() < UNEXPLAINED + 1e-9
-    assert eliminate(smoothed, PRICE, None) == [1]
+    assert Labelling.of(surfaces, extent).choose([into_the_box, TURN.T], PRICE, None)[0] == [1]
 
 
 def test_registered_keeps_the_kind_and_the_sign(turned: Turned) -> None:

@@ -3,9 +3,10 @@
 A point's cost under a motion is what the other state's photographs say of the place where the motion takes it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import combinations
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -22,8 +23,8 @@ HIDDEN_SEED_COST = 0.4
 NOBODY = 0.3
 """What a point without a partner in the other state hears from it, between a partner that disagrees (0) and one that
 agrees (1)."""
-PROMISING, EXCHANGED = 10, 6
-"""Motions that each round of a choice tries to add, and to exchange for one that is there."""
+PROMISING, EXCHANGED, PAIRED = 10, 6, 4
+"""Motions that each round of a choice tries to add, to exchange for one that is there, and to combine in exchange."""
 
 
 def label_costs(
@@ -146,8 +147,8 @@ class Labelling:
     def choose(self, T_1_0: Sequence[np.ndarray], part_cost: float, parts: int | None) -> tuple[list[int], Labels]:
         """The motions that explain both states at the least description length: energy and a price for each.
 
-        Motions are added, dropped and exchanged as long as that shortens it. That two points meet counts, so a
-        motion that explains a surface of one state by one that another motion explains already gains little.
+        That two points meet counts, so a motion gains little that would explain a surface of one state by a surface
+        of the other that has a better explanation.
 
         Args:
             T_1_0: motions to choose from.
@@ -159,32 +160,22 @@ class Labelling:
         """
         costs, partners = self.costs(T_1_0), self.partners(T_1_0)
 
+        def solve(columns: list[int], iterations: int) -> tuple[Labels, float]:
+            return self.mean_field([c[:, columns] for c in costs], [p[:, columns] for p in partners], iterations)
+
         @cache
         def solved(kept: frozenset[int]) -> tuple[Labels, float]:
-            columns = np.array([0, *sorted(kept)])
-            labels, energy = self.mean_field([c[:, columns] for c in costs], [p[:, columns] for p in partners], 8)
+            columns = [0, *sorted(kept)]
+            (first, second), energy = solve(columns, 8)
             price = part_cost * len(kept) if parts is None else sum(map(len, costs)) * abs(len(kept) - parts)
-            return (columns[labels[0]], columns[labels[1]]), energy + price
+            return (np.array(columns)[first], np.array(columns)[second]), energy + price
 
-        def length(kept: frozenset[int]) -> float:
-            return solved(kept)[1]
-
-        kept: frozenset[int] = frozenset()
-        while True:
-            others = [k for k in self.promising(costs, partners, solved(kept)[0]) if k not in kept]
-            smaller = [kept - {k} for k in sorted(kept)]
-            changed = smaller + [kept | {k} for k in others[:PROMISING]]
-            # Exchanges are many: they have their turn when nothing else helps.
-            exchanged = [less | {k} for less in smaller for k in others[:EXCHANGED]]
-            for trials in (changed, exchanged):
-                best = min(trials, key=length, default=kept)
-                if length(best) < length(kept) - 1:
-                    kept = best
-                    break
-            else:
-                columns = [0, *sorted(kept)]
-                first, second = (np.searchsorted(columns, labels) for labels in solved(kept)[0])
-                return [k - 1 for k in columns[1:]], (first, second)
+        kept = shortest(
+            lambda kept: solved(kept)[1],
+            lambda kept: self.promising(costs, partners, solved(kept)[0]),
+        )
+        chosen = sorted(kept)
+        return [k - 1 for k in chosen], solve([0, *chosen], 20)[0]
 
     def promising(self, costs: list[np.ndarray], partners: list[np.ndarray], labels: Labels) -> list[int]:
         """Labels (columns) but the first, those first that the points would gain most by if their partners agreed."""
@@ -199,6 +190,32 @@ class Labelling:
             average = (self.weights[s] @ better + better) / (1 + self.weights[s].sum(1))
             gain += np.maximum(np.asarray(average), 0).sum(0)
         return [int(k) for k in np.argsort(-gain) if k > 0]
+
+
+def shortest(
+    length: Callable[[frozenset[int]], float], promising: Callable[[frozenset[int]], Sequence[int]]
+) -> frozenset[int]:
+    """The set of the least length that adding, dropping and exchanging lead to, from the empty set.
+
+    ``promising`` names what may be added to a set, the best first. Two motions that are right together replace one
+    that is nearly right for both, which comes first.
+    """
+    kept: frozenset[int] = frozenset()
+    while True:
+        others = [k for k in promising(kept) if k not in kept]
+        smaller = [kept - {k} for k in sorted(kept)]
+        changed = smaller + [kept | {k} for k in others[:PROMISING]]
+        # Exchanges are many: they have their turn when nothing else helps.
+        exchanged = [less | {k} for less in smaller for k in others[:EXCHANGED]]
+        instead = [[k for k in promising(less) if k not in kept][:PAIRED] for less in smaller]
+        doubled = [less | set(pair) for less, ks in zip(smaller, instead, strict=True) for pair in combinations(ks, 2)]
+        for trials in (changed, exchanged, doubled):
+            best = min(trials, key=length, default=kept)
+            if length(best) < length(kept) - 1:
+                kept = best
+                break
+        else:
+            return kept
 
 
 def softmax(x: np.ndarray) -> np.ndarray:
