@@ -22,6 +22,9 @@ from hingesplat.visibility import FREE, SURFACE, Sight, ask
 COLOUR_SCALE = 0.2
 """RGB difference at which a surface of another colour counts half."""
 
+PROMISING = 0.6
+"""A coarse score that is this fraction of the best is worth a finer look."""
+
 HIDDEN_SCORE = 0.3
 """Score of unseen space, between a surface that fits (1) and free space (−1)."""
 
@@ -152,6 +155,8 @@ def _scan_revolute(
     low,
     high,
     reach,
+    stride,
+    wanted,
     best,
     pivots,
     thread,
@@ -163,6 +168,8 @@ def _scan_revolute(
         for a in range(3):
             c[a] += seeds[i, a] / m
     for job in range(thread, n_d * n_a, threads):
+        if not wanted[job // n_a, job % n_a]:
+            continue
         d, theta = directions[job // n_a], angles[job % n_a]
         helper = np.zeros(3)
         helper[np.argmin(np.abs(d))] = 1
@@ -178,12 +185,12 @@ def _scan_revolute(
             for a in range(3):
                 q[i, a] = c[a] + r[a] * cs + cross[a] * sn + d[a] * along * (1 - cs)
         half = 0.5 / np.tan(theta / 2)
-        n = int(min(reach, 2 * reach * abs(np.sin(theta / 2))) / voxel)
+        n = int(min(reach, 2 * reach * abs(np.sin(theta / 2))) / voxel) // stride
         shift = np.empty(3, np.float32)
         top = np.float32(-1)
         for ia in range(-n, n + 1):
             for ib in range(-n, n + 1):
-                ta, tb = ia * voxel, ib * voxel
+                ta, tb = ia * stride * voxel, ib * stride * voxel
                 # The fixed point of rotating by theta about c and then shifting by (ta, tb).
                 pa, pb = 0.5 * ta - half * tb, 0.5 * tb + half * ta
                 px, py, pz = (
@@ -292,7 +299,14 @@ def scan(
         box = (low, high) if near is None else (near.pivot - 4 * volume.voxel, near.pivot + 4 * volume.voxel)
         score = np.full((len(directions), len(angles)), -1, np.float32)
         pivots = np.zeros((*score.shape, 3))
-        parallel(_scan_revolute, threads, seeds32, colours32, directions, angles, *grid, *box, reach, score, pivots)
+        wanted = np.ones(score.shape, bool)
+        # Every second place first, since surfaces are three voxels thick; every place where that is promising.
+        for stride in (2, 1):
+            parallel(
+                _scan_revolute, threads, seeds32, colours32, directions, angles, *grid, *box, reach, stride, wanted,
+                score, pivots,
+            )  # fmt: skip
+            wanted = score > PROMISING * score.max(initial=0)
         found += [
             Motion("revolute", directions[i], pivots[i, j], float(angles[j]), float(score[i, j]))
             for i, j in np.ndindex(score.shape)

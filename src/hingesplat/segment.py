@@ -27,6 +27,8 @@ from hingesplat.visibility import FREE, HIDDEN, ask
 class SegmentConfig:
     """Finding the parts and their first motions."""
 
+    views: int = 60
+    """Photographs of each state that judge the hypotheses, at most."""
     sight_size: int = 200
     """Longest side in pixels of the depth pictures that judge the hypotheses."""
     tolerance: float = 0.012
@@ -71,11 +73,12 @@ def survey(
     low, high = bounds([g.means.numpy() for g in gaussians])
     extent = float((high - low).max())
     spacing, tolerance = config.spacing * extent, config.tolerance * extent
-    first, second = (
-        surface_of(g, v, m, config.sight_size, spacing, tolerance)
-        for g, v, m in zip(gaussians, views, maps, strict=True)
-    )
-    return low, high, (first, second)
+    surfaces = []
+    for g, v, m in zip(gaussians, views, maps, strict=True):
+        judges = np.linspace(0, len(v) - 1, min(len(v), config.views)).round().astype(int)
+        v, m = [v[i] for i in judges], [m[i] for i in judges] if m else []
+        surfaces.append(surface_of(g, v, m, config.sight_size, spacing, tolerance))
+    return low, high, (surfaces[0], surfaces[1])
 
 
 def floating(answer: np.ndarray) -> np.ndarray:
