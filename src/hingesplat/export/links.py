@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -104,12 +105,16 @@ def build_links(twin: Twin, meshes: dict[int, trimesh.Trimesh], config: ExportCo
     solids = {i: mesh for i, mesh in solids.items() if mesh is not None}
     if config.extend_limits:
         twin = replace(twin, joints=tuple(_extended(joint, twin, solids) for joint in twin.joints))
+    # Hulls are cut in the twin's own frame, so that no option cuts the mesh anew.
+    with ThreadPoolExecutor() as pool:
+        hulls = dict(zip(solids, pool.map(lambda mesh: collision_hulls(mesh, cache), solids.values()), strict=True))
     links: dict[int, Link] = {}
     for part in order:
         joint = twin.joint_of(part.id)
         # A part without a joint is held by the base, which is the root.
         parent = links.get(joint.parent if joint else 0)
-        links[part.id] = _link(names[part.id], part, joint, parent, solids.get(part.id), twin, config, cache)
+        solid, pieces = solids.get(part.id), hulls.get(part.id, ())
+        links[part.id] = _link(names[part.id], part, joint, parent, solid, pieces, twin, config)
     return list(links.values())
 
 
@@ -238,9 +243,9 @@ def _link(
     joint: Joint | None,
     parent: Link | None,
     solid: trimesh.Trimesh | None,
+    pieces: tuple[trimesh.Trimesh, ...],
     twin: Twin,
     config: ExportConfig,
-    cache: Path,
 ) -> Link:
     R, factor = placement(twin, config)
     origin = np.zeros(3)
@@ -258,8 +263,7 @@ def _link(
         return Link(name, part, joint, parent, origin, None, (), 1e-3, np.zeros(3), token)
     T_link_twin = np.eye(4)
     T_link_twin[:3, :3], T_link_twin[:3, 3] = factor * R, -origin
-    # Hulls are cut in the twin's own frame, so that no option cuts the mesh anew.
-    hulls = tuple(h.copy().apply_transform(T_link_twin) for h in collision_hulls(solid, cache))
+    hulls = tuple(piece.copy().apply_transform(T_link_twin) for piece in pieces)
     mesh = solid.copy().apply_transform(T_link_twin)
     mesh.density = config.density
     inertia = np.asarray(mesh.moment_inertia)
