@@ -12,7 +12,9 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -80,7 +82,8 @@ def simulation(export: Path) -> dict[str, Any]:
         why = "MuJoCo is not installed; pip install 'hingesplat[sim]'"
     if why:
         return {"simulation": None, "simulation_why_null": why}
-    checks = {form: _check("mujoco", path) for form, path in files.items()}
+    with ThreadPoolExecutor() as pool:
+        checks = dict(zip(files, pool.map(partial(_check, "mujoco"), files.values()), strict=True))
     each = {form: asdict(check) | {"ok": check.ok} for form, check in checks.items()}
     ok = all(check.ok for check in checks.values())
     return {"simulation": {"ok": ok, "program": checks["mjcf"].program, **each}, "simulation_why_null": None}
