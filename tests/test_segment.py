@@ -519,6 +519,18 @@ def test_of_a_part_the_largest_piece_stays_and_of_the_base_every_large_one() -> 
         np.testing.assert_array_equal(found, np.repeat([0, 0, 1, 0], [400, 100, 225, 196]))
 
 
+@pytest.mark.parametrize(("cost", "label"), [(0.9, 1), (0.3, 0)])
+def test_a_fragment_that_the_photographs_are_sure_of_stays_what_it_is(monkeypatch, cost: float, label: int) -> None:
+    """A knife's blade touches only the handle; ``cost`` is what the photographs say of it if it had stayed there."""
+    monkeypatch.setattr(
+        "hingesplat.pieces.label_costs", lambda surface, *_, **__: np.tile([cost, 0.1], (len(surface.points), 1))
+    )
+    surfaces = both_states((PART, SHIFT), (patch((0, 0, -0.95), 14), SHIFT))
+    given = np.repeat([0, 1, 1], [400, 225, 196])
+    for found in reattach_fragments([SHIFT.T], (given, given), surfaces, 1.0):
+        np.testing.assert_array_equal(found, np.repeat([0, 1, label], [400, 225, 196]))
+
+
 def test_labels_spread_to_the_nearest() -> None:
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0.2, 0, 0], [0.9, 0, 0]])
     assert spread_labels(points, plain(points[:2]), np.array([3, 5])).tolist() == [3, 5, 3, 5]

@@ -5,12 +5,15 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import KDTree
 
+from hingesplat.labelling import label_costs
 from hingesplat.se3 import moved
 from hingesplat.search import Motion
 from hingesplat.surface import Labels, Surface, components
 
 LARGE_PIECE = 0.2
 """A piece this large beside the largest of its part is a part of its own, not a fragment."""
+SURE = 0.4
+"""A fragment that costs so much more with what it touches, on average, stays what it is."""
 
 
 def spacing(points: np.ndarray) -> float:
@@ -82,20 +85,36 @@ def _rejoined(motions: Sequence[Motion], owned: Labels, surfaces: tuple[Surface,
 def reattach_fragments(
     T_1_0: Sequence[np.ndarray], owned: Labels, surfaces: tuple[Surface, Surface], extent: float
 ) -> Labels:
-    """Small pieces apart from their part's main one go to whatever they touch: nothing floats in the air."""
+    """Small pieces apart from their part's main one go to whatever they touch: nothing floats in the air.
+
+    Unless the photographs are sure of them: a knife's blade touches only the handle that it slides in.
+    """
     stray = (np.zeros(len(owned[0]), bool), np.zeros(len(owned[1]), bool))
+    fragments = []
     for k, T in enumerate([np.eye(4), *T_1_0]):
         rows, piece = _pieces(k, T, owned, surfaces, extent)
         size = np.bincount(np.concatenate(piece), minlength=1)
-        small = size < (size.max() if k else 0.02 * size.max())
-        for s in (0, 1):
-            stray[s][rows[s][small[piece[s]]]] = True
+        for p in np.flatnonzero((size > 0) & (size < (size.max() if k else 0.02 * size.max()))):
+            fragments.append((k, [rows[s][piece[s] == p] for s in (0, 1)]))
+            for s in (0, 1):
+                stray[s][fragments[-1][1][s]] = True
     labels = (owned[0].copy(), owned[1].copy())
+    regret = (np.zeros(len(owned[0])), np.zeros(len(owned[1])))
     for s in (0, 1):
         if stray[s].any() and not stray[s].all():
             points = surfaces[s].points
             nearest = KDTree(points[~stray[s]]).query(points[stray[s]])[1]
             labels[s][stray[s]] = owned[s][~stray[s]][nearest]
+            transforms = T_1_0 if s == 0 else [np.linalg.inv(T) for T in T_1_0]
+            costs = label_costs(
+                surfaces[s].rows(np.flatnonzero(stray[s])), surfaces[1 - s].sight, transforms, extent=extent
+            )
+            row = np.arange(len(costs))
+            regret[s][stray[s]] = costs[row, labels[s][stray[s]]] - costs[row, owned[s][stray[s]]]
+    for k, rows in fragments:
+        if np.concatenate([regret[s][rows[s]] for s in (0, 1)]).mean() > SURE:
+            for s in (0, 1):
+                labels[s][rows[s]] = k
     return labels
 
 
