@@ -3,7 +3,7 @@
 A point's cost under a motion is what the other state's photographs say of the place where the motion takes it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import combinations
@@ -200,17 +200,20 @@ def shortest(
     ``promising`` names what may be added to a set, the best first. Two motions that are right together replace one
     that is nearly right for both, which comes first.
     """
-    kept: frozenset[int] = frozenset()
-    while True:
+
+    def trials(kept: frozenset[int]) -> Iterator[list[frozenset[int]]]:
+        """Sets beside ``kept``, the few first: what is many has its turn when nothing else helps."""
         others = [k for k in promising(kept) if k not in kept]
         smaller = [kept - {k} for k in sorted(kept)]
-        changed = smaller + [kept | {k} for k in others[:PROMISING]]
-        # Exchanges are many: they have their turn when nothing else helps.
-        exchanged = [less | {k} for less in smaller for k in others[:EXCHANGED]]
+        yield smaller + [kept | {k} for k in others[:PROMISING]]
+        yield [less | {k} for less in smaller for k in others[:EXCHANGED]]
         instead = [[k for k in promising(less) if k not in kept][:PAIRED] for less in smaller]
-        doubled = [less | set(pair) for less, ks in zip(smaller, instead, strict=True) for pair in combinations(ks, 2)]
-        for trials in (changed, exchanged, doubled):
-            best = min(trials, key=length, default=kept)
+        yield [less | set(pair) for less, ks in zip(smaller, instead, strict=True) for pair in combinations(ks, 2)]
+
+    kept: frozenset[int] = frozenset()
+    while True:
+        for beside in trials(kept):
+            best = min(beside, key=length, default=kept)
             if length(best) < length(kept) - 1:
                 kept = best
                 break
