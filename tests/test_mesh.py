@@ -12,17 +12,16 @@ from scipy.spatial import KDTree
 from hingesplat.camera import Camera
 from hingesplat.gaussians import SH_C0, Gaussians, concatenate
 from hingesplat.mesh import (
-    DepthView,
     MeshConfig,
     close_surface,
-    fuse_depth,
     hull_mesh,
     mesh_parts,
-    tangent_planes,
 )
+from hingesplat.metrics.surface import penetration
 from hingesplat.se3 import matrix_to_wxyz
 from hingesplat.stereo import DepthMap
-from hingesplat.twin import Joint
+from hingesplat.tsdf import DepthView, distance_to, fuse_depth, tangent_planes
+from hingesplat.twin import Joint, Part, Twin
 
 
 def look_at(eye: np.ndarray, target: np.ndarray | None = None, size: int = 96) -> Camera:
@@ -53,7 +52,7 @@ def traced(camera: Camera, mesh: trimesh.Trimesh) -> DepthView:
     depth[index] = (points - origin) @ camera.T_world_camera[:3, 2]
     depth = depth.reshape(camera.height, camera.width)
     rgb = np.full((*depth.shape, 3), 0.5, np.float32)
-    return DepthView(camera, depth, np.isfinite(depth), rgb, tangent_planes(camera, depth))
+    return DepthView(camera, depth, np.isfinite(depth), rgb, tangent_planes(camera, depth, 0.05))
 
 
 def fused(shape: trimesh.Trimesh, cameras: list[Camera], resolution: int = 64) -> trimesh.Trimesh | None:
@@ -61,8 +60,8 @@ def fused(shape: trimesh.Trimesh, cameras: list[Camera], resolution: int = 64) -
     lower = shape.bounds[0] - 4 * voxel
     grid = tuple(int(n) for n in np.ceil(shape.extents / voxel) + 9)
     assert len(grid) == 3
-    distance, _ = fuse_depth([traced(c, shape) for c in cameras], lower, grid, voxel, 2.5 * voxel)
-    return close_surface(distance, lower, voxel, MeshConfig())
+    fusion = fuse_depth([traced(c, shape) for c in cameras], lower, grid, voxel, 2.5 * voxel)
+    return close_surface(fusion.distance, lower, voxel, MeshConfig())
 
 
 def box_gaussians(
@@ -108,7 +107,8 @@ def test_a_shape_seen_from_everywhere_comes_back_closed_and_of_its_size(make: Ca
 def test_the_unknown_stays_unknown_and_free_space_is_outside():
     wall = trimesh.creation.box((4.0, 4.0, 0.2))
     view = traced(look_at(np.array([0.0, 0.0, 3.0])), wall)
-    distance, weight = fuse_depth([view], np.array([0.0, 0.0, -1.0]), (1, 1, 41), 0.05, 0.1)
+    grid = fuse_depth([view], np.array([0.0, 0.0, -1.0]), (1, 1, 41), 0.05, 0.1)
+    distance, weight = grid.distance, grid.weight
     z = np.linspace(-1, 1, 41)
     assert (distance[0, 0, z > 0.21] == 1).all() and (weight[0, 0, z > 0.21] > 0).all()
     assert (weight[0, 0, z < -0.01] == 0).all()
@@ -119,7 +119,7 @@ def test_the_unknown_stays_unknown_and_free_space_is_outside():
 def test_a_stranger_in_front_clears_only_what_lies_before_it():
     wall = trimesh.creation.box((4.0, 4.0, 0.2))
     view = replace(traced(look_at(np.array([0.0, 0.0, 3.0])), wall), own=np.zeros((96, 96), bool))
-    _, weight = fuse_depth([view], np.array([0.0, 0.0, -1.0]), (1, 1, 41), 0.05, 0.1)
+    weight = fuse_depth([view], np.array([0.0, 0.0, -1.0]), (1, 1, 41), 0.05, 0.1).weight
     z = np.linspace(-1, 1, 41)
     assert (weight[0, 0, z < 0.19] == 0).all() and (weight[0, 0, z > 0.21] == 1).all()
 
@@ -225,10 +225,60 @@ def test_a_block_is_solid_though_no_camera_sees_its_underside():
 def test_what_is_unseen_in_the_depth_of_an_open_carcass_is_empty():
     """Only its back and floor are seen through the opening, and behind the walls there is no more than a wall."""
     lying = trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])
-    carcass = open_box((0.8, 0.8, 0.8), 0.05).apply_transform(lying)
+    carcass = open_box((0.8, 0.8, 0.8), 0.04).apply_transform(lying)
     front = [c for c in sphere_of_cameras(120) if c.centre[1] < -2.9]
     cameras = front + [c for c in sphere_of_cameras(24) if c.centre[1] > -1]
     maps = [[known_depth(c, carcass) for c in cameras]]
     scene = box_gaussians((0.8, 0.8, 0.8), (0, 0, 0), 0)
     mesh = mesh_parts(scene, [(cameras, {})], MeshConfig(resolution=48, image_size=96), maps=maps)[0]
     assert mesh.is_watertight and mesh.volume == pytest.approx(carcass.volume, rel=0.1)
+
+
+def test_no_part_is_where_another_has_been():
+    """A slab in the dark of a block: what hides it might be solid, but the slab needs a way out."""
+    block = trimesh.creation.box((0.8, 0.8, 0.5))
+    slab = trimesh.creation.box((0.5, 0.5, 0.2), trimesh.transformations.translation_matrix([0, 0.1, 0]))
+    scene = concatenate([box_gaussians((0.8, 0.8, 0.5), (0, 0, 0), 0), box_gaussians((0.5, 0.5, 0.2), (0, 0.1, 0), 1)])
+    joint = Joint(1, 0, "prismatic", (0.0, -1.0, 0.0), (0.0, 0.0, 0.0), (0.0, 1.0), (0.0, 1.0))
+    twin = Twin((Part(0, "base", 0), Part(1, "slab", 0)), (joint,))
+    cameras = sphere_of_cameras(36)
+    states, maps = [], []
+    for state in (0, 1):
+        poses = twin.at_state(state)
+        whole = trimesh.util.concatenate([block, slab.copy().apply_transform(poses[1])])
+        states.append((cameras, poses))
+        maps.append([known_depth(c, whole) for c in cameras])
+    config = MeshConfig(resolution=64, image_size=96)
+    shut, free = (mesh_parts(scene, states, config, maps=maps, path=p) for p in ((), twin.on_the_way(1, 12)))
+    within, without = (
+        penetration(m[0], m[1], [poses[1] for poses in twin.on_the_way(1, 7)]).volume_fraction for m in (shut, free)
+    )
+    assert without < 0.05 < 0.3 < within
+    assert free[0].is_watertight and 0.15 * block.volume < free[0].volume < shut[0].volume
+    assert free[0].bounds == pytest.approx(block.bounds, abs=0.03)
+
+
+def test_distance_to_another_grid_is_the_least_over_its_poses():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.3)
+    views = [traced(c, ball) for c in sphere_of_cameras(40, size=240)]
+    grid = fuse_depth(views, np.full(3, -0.5), (51, 51, 51), 0.02, 0.05)
+    apart = trimesh.transformations.translation_matrix([0.4, 0, 0])
+    found = distance_to(grid, grid, [np.eye(4), apart])
+    x, y, z = np.moveaxis(np.indices(grid.distance.shape) * 0.02 - 0.5, 0, 0)
+    true = np.minimum(np.hypot(np.hypot(x, y), z), np.hypot(np.hypot(x - 0.4, y), z)) - 0.3
+    assert ((found < 0) == (true < 0))[np.abs(true) > 0.01].all()
+    assert np.abs(found - true)[(true > -0.03) & (true < 0)].mean() < 0.005
+    assert np.isinf(distance_to(grid, grid, [trimesh.transformations.translation_matrix([3, 0, 0])])).all()
+
+
+def test_tangent_planes_are_those_of_a_slanted_wall_whatever_stands_behind_it():
+    camera = look_at(np.array([0.0, 0.0, 3.0]))
+    normal = np.array([0.3, 0.2, 1.0]) / np.linalg.norm([0.3, 0.2, 1.0])
+    origin, rays = camera.rays()
+    depth = -(origin @ normal) / (rays @ normal) * (rays @ camera.T_world_camera[:3, 2])
+    depth[:, 60:] += 1.0
+    planes = tangent_planes(camera, depth, 0.2)[2:-2, 2:-2]
+    assert (planes[..., 4] > 0).all()
+    in_camera = camera.T_world_camera[:3, :3].T @ normal
+    assert planes[:, :56, :3] == pytest.approx(np.broadcast_to(in_camera, planes[:, :56, :3].shape), abs=1e-4)
+    assert planes[:, :56, 3] == pytest.approx(-(origin @ normal) * -1, abs=1e-3)

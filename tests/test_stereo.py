@@ -97,7 +97,7 @@ def test_what_has_no_texture_stays_unknown() -> None:
     views = open_box(SIZE, grey=True)
     found, true = known(stereo(views, CONFIG), views)
     assert share(found > 0) < 0.1  # Outlines are all that can be compared.
-    assert share((found > 0) & (np.abs(found - true) > 0.05)) < 0.03
+    assert share((found > 0) & (np.abs(found - true) > 0.05)) < 0.07
 
 
 @pytest.mark.parametrize("n", [1, 2])

@@ -1,9 +1,9 @@
 """Part meshes: fuse depth of all states into one signed distance grid a part, then close it.
 
-Truncated signed distance fusion (Curless and Levoy 1996) with point-to-plane distances. Depth is that of the
-Gaussians, and where stereo contradicts it, that of stereo: fits put lids on hollows. A view of any state carves a
-part in the part's own frame. What no view ever saw is solid behind the surfaces that were seen, as thick as a wall,
-and farther in where these close around it.
+Depth is that of the Gaussians, and where stereo contradicts it, that of stereo: fits put lids on hollows. A view of
+any state carves a part in the part's own frame. What no view ever saw is solid behind the surfaces that were seen, as
+thick as a wall, and farther in where these close around it; but two parts are never in one place, so the base has room
+for its movers all along their way.
 """
 
 import logging
@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import manifold3d
-import numba
 import numpy as np
 import torch
 import trimesh
@@ -24,14 +23,11 @@ from hingesplat.camera import Camera
 from hingesplat.gaussians import SH_C0, Gaussians, posed
 from hingesplat.render import rasterize
 from hingesplat.se3 import wxyz_to_matrix
-from hingesplat.simd import parallel
-from hingesplat.stereo import DepthMap, cubes, seen_through
+from hingesplat.stereo import DepthMap, contradicted, cubes
+from hingesplat.tsdf import DepthView, DistanceGrid, distance_to, fuse_depth, tangent_planes
 
 log = logging.getLogger(__name__)
 
-WALL, DEEP = np.float32(2.0), np.float32(0.001)
-"""How much lying just behind the part's own surface says for being inside, and lying farther behind, beside the 1 of a
-view that sees through. It takes several good views to hollow a wall, and few to see into what lies behind it."""
 HOLLOW = 0.2
 """An unseen pocket is empty where more than this share of what borders on it was seen to be."""
 
@@ -48,30 +44,18 @@ class MeshConfig:
     """Voxels along the longest side of each part's own box."""
     truncation: float = 2.5
     """Depth of the band behind a surface, voxels; at most half of the thinnest wall."""
-    reach: float = 0.04
+    reach: float = 0.03
     """How far behind its surface unseen space belongs to a part in any case; fraction of its longest side."""
     spread: float = 0.02
     """Pixels whose blended depths deviate by more than this (fraction of the scene) are not used."""
+    steps: int = 24
+    """Places on the way from state to state at which the base leaves room for its movers."""
+    clearance: float = 0.3
+    """Gap between the base and what moves in it, voxels of the base."""
     floater: float = 0.02
     """Components with less than this share of the part's surface are dropped."""
     max_triangles: int = 50_000
     """Triangles a part at most."""
-
-
-@dataclass(frozen=True)
-class DepthView:
-    """What one view says of one part."""
-
-    camera: Camera
-    """In the frame of the part."""
-    depth: np.ndarray
-    """(height, width) float32 z-depth of the first surface; inf: the ray meets nothing; nan: not known."""
-    own: np.ndarray
-    """(height, width) bool: that surface belongs to the part."""
-    rgb: np.ndarray
-    """(height, width, 3) float32 in [0, 1]."""
-    planes: np.ndarray
-    """(height, width, 5) float32, what ``tangent_planes`` gives."""
 
 
 def mesh_parts(
@@ -80,6 +64,7 @@ def mesh_parts(
     config: MeshConfig | None = None,
     *,
     maps: Sequence[Sequence[DepthMap]] = (),
+    path: Sequence[Mapping[int, np.ndarray]] = (),
 ) -> dict[int, trimesh.Trimesh]:
     """Closed, coloured triangle meshes of every part, in the frame of state 0.
 
@@ -89,6 +74,7 @@ def mesh_parts(
             (4×4), as ``Twin.at_state`` gives them.
         config: defaults when None.
         maps: for each state the depth that stereo knows of each of its cameras; without them, rendered depth is all.
+        path: part poses like those of ``states``, all along the motion: places where the base (part 0) leaves room.
 
     Returns:
         ``{part id: mesh}``: watertight 2-manifolds with vertex colours; the convex hull of a part's Gaussians
@@ -97,75 +83,18 @@ def mesh_parts(
     config = config or MeshConfig()
     ids = [int(i) for i in gaussians.part.unique()]
     views = _depth_views(gaussians.detached(), states, ids, config, maps)
+    grids = _solids(views, [*(poses for _, poses in states), *path], config)
     meshes = {}
     for i in ids:
-        part = gaussians[gaussians.part == i].detached()
-        mesh, truncation = _close_part(views[i], config)
+        part, grid = gaussians[gaussians.part == i].detached(), grids.get(i)
+        mesh = None if grid is None else close_surface(grid.distance, grid.lower, grid.voxel, config)
         if mesh is None:
             log.warning("part %d: its surface does not close; its convex hull stands in", i)
             mesh = hull_mesh(part)
-        mesh.visual = ColorVisuals(mesh, vertex_colors=_vertex_colours(mesh, part, views[i], truncation))
+        tolerance = np.inf if grid is None else grid.truncation
+        mesh.visual = ColorVisuals(mesh, vertex_colors=_vertex_colours(mesh, part, views[i], tolerance))
         meshes[i] = mesh
     return meshes
-
-
-def fuse_depth(
-    views: Sequence[DepthView],
-    lower: np.ndarray,
-    shape: tuple[int, int, int],
-    voxel: float,
-    truncation: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Fuse depth maps into a grid of signed distances.
-
-    Args:
-        views: cameras in the grid's frame.
-        lower: (3,) centre of voxel (0, 0, 0).
-        shape: voxels along each axis.
-        voxel: edge of a voxel, scene units.
-        truncation: scene units.
-
-    Returns:
-        ``distance`` in [-1, 1] (units of the truncation, positive outside) and ``weight`` (0 where no view
-        saw free space or a surface), both float32 of ``shape``.
-    """
-    total, weight, free, behind = (np.zeros(shape, np.float32) for _ in range(4))
-    T_part_grid = np.diag([voxel, voxel, voxel, 1.0])
-    T_part_grid[:3, 3] = lower
-    for view in views:
-        T = view.camera.T_camera_world[:3] @ T_part_grid
-        parallel(
-            _integrate, torch.get_num_threads(), total, weight, free, behind,
-            (view.camera.K @ T).astype(np.float32), T.astype(np.float32),
-            np.float32(truncation), view.depth, view.own, view.planes,
-        )  # fmt: skip
-    free = np.maximum(free - behind, 0)
-    weight += free
-    return np.where(weight > 0, (total + free) / np.maximum(weight, 1e-6), -1).astype(np.float32), weight
-
-
-def tangent_planes(camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """The plane at each pixel of a depth map: (height, width, 5) float32, normal, offset, weight.
-
-    ``n·x + offset`` is the signed distance of the camera-frame point x, positive towards the camera; the
-    weight is the cosine of incidence, and 0 where a neighbour is missing or the surface turns edge-on.
-    """
-    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
-    points = rays * np.where(np.isfinite(depth), depth, np.nan)[..., None]
-    out = np.zeros((camera.height, camera.width, 5), np.float32)
-    across = points[1:-1, 2:] - points[1:-1, :-2]
-    down = points[2:, 1:-1] - points[:-2, 1:-1]
-    normal = np.cross(down, across)  # image y points down, so this one faces the camera
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-30)
-    inner, ray = points[1:-1, 1:-1], rays[1:-1, 1:-1]
-    cosine = -(normal * ray).sum(-1) / np.linalg.norm(ray, axis=-1)
-    good = np.isfinite(cosine) & (cosine > 0.15)
-    out[1:-1, 1:-1, :3] = normal
-    out[1:-1, 1:-1, 3] = -(normal * inner).sum(-1)
-    out[1:-1, 1:-1, 4] = cosine
-    out[1:-1, 1:-1][~good] = 0
-    return out
 
 
 def close_surface(distance: np.ndarray, lower: np.ndarray, voxel: float, config: MeshConfig) -> trimesh.Trimesh | None:
@@ -210,21 +139,56 @@ def _refined(solid: manifold3d.Manifold, length: float, most: int) -> manifold3d
     return fine
 
 
-def _close_part(views: list[DepthView], config: MeshConfig) -> tuple[trimesh.Trimesh | None, float]:
-    """Distance grid, rule for the unseen, closed surface: the part's mesh, if there is one, and the truncation."""
-    surface = _surface_points(views, config.resolution)
-    if not len(surface):
-        return None, np.inf
-    extent = float(np.ptp(surface, axis=0).max())
-    voxel = extent / config.resolution
-    truncation = config.truncation * voxel
+def _solids(
+    views: Mapping[int, list[DepthView]], poses: Sequence[Mapping[int, np.ndarray]], config: MeshConfig
+) -> dict[int, DistanceGrid]:
+    """Distances of every part that was seen, no two parts in one place.
+
+    What was seen stays before what was guessed, and the base gives way to its movers: a mover's guess ends where the
+    base was seen, and all that a mover passes through on its way is empty, as if it had been seen to be.
+    """
+    grids, surfaces = {}, {}
+    for i in views:
+        surface = _surface_points(views[i], config.resolution)
+        if len(surface):
+            grids[i], surfaces[i] = _fused_grid(views[i], surface, config), surface
+    base = grids.get(0)
+    if base is None:
+        return {i: _filled(grid, surfaces[i], config) for i, grid in grids.items()}
+    known = replace(base, distance=np.where(base.weight > 0, base.distance, np.float32(1)))
+    room = np.full(base.distance.shape, np.inf, np.float32)
+    for i in grids.keys() - {0}:
+        T_base_mover = [p.get(i, np.eye(4)) for p in poses]
+        mover = _filled(grids[i], surfaces[i], config)
+        taken = -distance_to(mover, known, [np.linalg.inv(T) for T in T_base_mover]) / mover.truncation
+        guess = np.maximum(mover.distance, np.minimum(taken, 1))
+        grids[i] = mover = replace(mover, distance=np.where(mover.weight > 0, mover.distance, guess))
+        room = np.minimum(room, distance_to(base, mover, T_base_mover))
+    emptied = (base.weight == 0) & (room < 0)
+    base = replace(
+        base, distance=np.where(emptied, np.float32(1), base.distance), weight=np.where(emptied, 1, base.weight)
+    )
+    base = _filled(base, surfaces[0], config)
+    taken = (config.clearance * base.voxel - room) / base.truncation
+    grids[0] = replace(base, distance=np.maximum(base.distance, np.minimum(taken, 1)))
+    return grids
+
+
+def _fused_grid(views: list[DepthView], surface: np.ndarray, config: MeshConfig) -> DistanceGrid:
+    """Depth fused on a grid around the surface (n, 3)."""
+    voxel = float(np.ptp(surface, axis=0).max()) / config.resolution
     lower = surface.min(0) - 3 * voxel
     nx, ny, nz = (int(n) + 4 for n in np.ceil((surface.max(0) - lower) / voxel))
-    distance, weight = fuse_depth(views, lower, (nx, ny, nz), voxel, truncation)
-    unseen = weight == 0
-    solid = _solid_unseen(distance, unseen, surface, lower, voxel, config.reach * extent)
-    distance[unseen] = np.where(solid, -1, 1)[unseen]
-    return close_surface(ndimage.gaussian_filter(distance, 0.7), lower, voxel, config), truncation
+    return fuse_depth(views, lower, (nx, ny, nz), voxel, config.truncation * voxel)
+
+
+def _filled(grid: DistanceGrid, surface: np.ndarray, config: MeshConfig) -> DistanceGrid:
+    """The rule for the unseen, and a little smoothing."""
+    unseen = grid.weight == 0
+    reach = config.reach * float(np.ptp(surface, axis=0).max())
+    solid = _solid_unseen(grid.distance, unseen, surface, grid.lower, grid.voxel, reach)
+    distance = np.where(unseen, np.where(solid, -1, 1), grid.distance).astype(np.float32)
+    return replace(grid, distance=ndimage.gaussian_filter(distance, 0.7))
 
 
 def _solid_unseen(
@@ -293,7 +257,7 @@ def _depth_views(
             depth, part, rgb = _rendered(scene, camera, ids, limit)
             if maps:
                 _correct(depth, part, scene, maps[t], number, limit)
-            planes = tangent_planes(camera, depth)
+            planes = tangent_planes(camera, depth, limit)
             for i in ids:
                 T_part_camera = np.linalg.inv(poses.get(i, np.eye(4))) @ camera.T_world_camera
                 views[i].append(DepthView(replace(camera, T_world_camera=T_part_camera), depth, part == i, rgb, planes))
@@ -331,54 +295,15 @@ def _correct(
     """Put in, in place, what stereo knows better: its depth where the two differ, nothing where it sees through."""
     camera, known = maps[number].camera, maps[number].depth
     y, x = np.nonzero(np.isfinite(depth) & (known == 0))
-    lid = seen_through(camera.lifted(x, y, depth[y, x]), maps, limit) >= 2
+    lid = contradicted(camera.lifted(x, y, depth[y, x]), maps, limit)
     depth[y[lid], x[lid]], part[y[lid], x[lid]] = np.nan, -1
     # Where they agree, the rendered depth is the smoother one.
     y, x = np.nonzero((known > 0) & ((part < 0) | ~(np.abs(known - depth) < 0.5 * limit)))
-    depth[y, x] = known[y, x]
+    depth[known > 0] = known[known > 0]
     seen = scene[scene.opacities > 0.1]
     if len(y) and len(seen):
         nearest = KDTree(seen.means.numpy()).query(camera.lifted(x, y, known[y, x]))[1]
         part[y, x] = seen.part.numpy()[nearest]
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _integrate(total, weight, free, behind, P, T, truncation, depth, own, planes, thread, threads):  # pragma: no cover
-    """Add one view to the grid, in place. ``P`` (3, 4) takes voxels to pixels, ``T`` (3, 4) to the camera's frame."""
-    height, width = depth.shape
-    nx, ny, nz = total.shape
-    for i in range(thread, nx, threads):
-        for j in range(ny):
-            a0 = P[0, 0] * i + P[0, 1] * j + P[0, 3]
-            b0 = P[1, 0] * i + P[1, 1] * j + P[1, 3]
-            z0 = P[2, 0] * i + P[2, 1] * j + P[2, 3]
-            for k in range(nz):
-                z = z0 + P[2, 2] * k
-                if z <= 1e-6:
-                    continue
-                inverse = 1 / z
-                a, b = (a0 + P[0, 2] * k) * inverse, (b0 + P[1, 2] * k) * inverse
-                if a < 0 or b < 0 or a >= width or b >= height:
-                    continue
-                u, v = int(a), int(b)
-                d = depth[v, u]
-                if np.isnan(d):
-                    continue
-                if z < d - 4 * truncation or (not own[v, u] and z < d - truncation):
-                    free[i, j, k] += 1
-                elif own[v, u] and planes[v, u, 4] > 0:
-                    x = T[0, 0] * i + T[0, 1] * j + T[0, 2] * k + T[0, 3]
-                    y = T[1, 0] * i + T[1, 1] * j + T[1, 2] * k + T[1, 3]
-                    s = planes[v, u, 0] * x + planes[v, u, 1] * y + planes[v, u, 2] * z + planes[v, u, 3]
-                    s /= truncation
-                    if s < -1:
-                        behind[i, j, k] += WALL * max((3 + s) / 2, 0) + DEEP
-                    elif s > 1:
-                        free[i, j, k] += 1
-                    else:  # Votes fade at both ends alike, so that noise does not shift the surface.
-                        w = planes[v, u, 4] * min(2 - 2 * abs(s), 1.0)
-                        total[i, j, k] += w * s
-                        weight[i, j, k] += w
 
 
 def _surface_points(views: Sequence[DepthView], resolution: int) -> np.ndarray:

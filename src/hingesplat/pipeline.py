@@ -417,7 +417,8 @@ def _mesh(run: Run) -> None:
     gaussians, twin = load_result(run.folder)
     states = [([v.camera for v in views], twin.at_state(t)) for t, views in enumerate(run.views)]
     maps = [_depth(run, t) for t in range(len(states))]
-    meshes = mesh_parts(gaussians, states, run.config.mesh, maps=maps)
+    path = [poses for t in range(1, len(states)) for poses in twin.on_the_way(t, run.config.mesh.steps)]
+    meshes = mesh_parts(gaussians, states, run.config.mesh, maps=maps, path=path)
     parts = []
     with whole_folder(run / "parts") as folder:
         for part in twin.parts:

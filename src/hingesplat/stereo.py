@@ -33,6 +33,10 @@ class StereoConfig:
     """How many of them must show the same: the others may be hidden from."""
     window: int = 5
     """Side in pixels of the patches compared."""
+    bend: float = 0.002
+    """Price of a step to the next plane between neighbouring pixels, as a difference of colour."""
+    jump: float = 0.02
+    """Price of a farther step, where the photograph shows no edge."""
     agree: int = 2
     """Depth maps that must confirm a point, besides its own."""
     tolerance: float = 0.01
@@ -175,6 +179,12 @@ def seen_through(points: np.ndarray, maps: Sequence[DepthMap], tolerance: float)
     return _votes(points, maps, tolerance / 2)[1]
 
 
+def contradicted(points: np.ndarray, maps: Sequence[DepthMap], tolerance: float) -> np.ndarray:
+    """(n,) bool: at least two maps see through points (n, 3), and more than put their surface there."""
+    same, through = _votes(points, maps, tolerance / 2)
+    return (through >= 3) & (through > 2 * same)
+
+
 def _votes(points: np.ndarray, maps: Sequence[DepthMap], tolerance: float) -> tuple[np.ndarray, np.ndarray]:
     """How many maps put their surface within ``tolerance`` of each point (n, 3), and how many twice as far behind."""
     same, through = np.zeros(len(points), int), np.zeros(len(points), int)
@@ -226,8 +236,16 @@ def sweep(picture: Picture, others: Sequence[Picture], planes: np.ndarray, confi
     for k, other in enumerate(others):
         A, b = _pixel_to_pixel(camera, other.camera)
         parallel(_match, threads, reference, other.rgba, A, b, planes, config.window // 2, cost[k])
+    curve = np.empty((*reference.shape[:2], len(planes)), np.float32)
+    parallel(_least, threads, cost, min(config.best, len(others)), curve)
+    smooth = np.zeros_like(curve)
+    for image, c, total in (
+        (reference, curve, smooth),
+        (reference.swapaxes(0, 1), curve.swapaxes(0, 1), smooth.swapaxes(0, 1)),
+    ):
+        parallel(_along_rows, threads, image, c, np.float32(config.bend), np.float32(config.jump), total)
     found = np.zeros(reference.shape[:2], np.float32)
-    parallel(_winner, threads, cost, (1 / planes).astype(np.float32), min(config.best, len(others)), found)
+    parallel(_winner, threads, smooth, (1 / planes).astype(np.float32), found)
     depth[window] = np.where(reference[..., 3] > 0.5, found, 0)
     return depth
 
@@ -294,10 +312,10 @@ def _match(reference, other, A, b, planes, radius, cost, thread, threads):  # pr
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _winner(cost, inverse_planes, best, depth, thread, threads):  # pragma: no cover - compiled
-    """The depth at which the ``best`` most alike pictures differ least, between the planes by a parabola."""
+def _least(cost, best, curve, thread, threads):  # pragma: no cover - compiled
+    """Mean cost (h, w, planes) of the ``best`` most alike pictures."""
     n, planes, h, w = cost.shape
-    curve, least, carried = np.empty((planes, w), np.float32), np.empty((best, w), np.float32), np.empty(w, np.float32)
+    least, carried = np.empty((best, w), np.float32), np.empty(w, np.float32)
     for y in range(thread, h, threads):
         for p in range(planes):
             least[:] = np.inf
@@ -308,14 +326,54 @@ def _winner(cost, inverse_planes, best, depth, thread, threads):  # pragma: no c
                         low, high = min(carried[x], least[m, x]), max(carried[x], least[m, x])
                         least[m, x], carried[x] = low, high
             for x in range(w):
-                curve[p, x] = least[:, x].sum()
+                curve[y, x, p] = least[:, x].sum() / best
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _along_rows(rgba, curve, bend, jump, total, thread, threads):  # pragma: no cover - compiled
+    """Add to ``total`` the costs gathered along each row from either side (semi-global matching, Hirschmuller 2008)."""
+    h, w, planes = curve.shape
+    path, last = np.empty(planes + 2, np.float32), np.empty(planes + 2, np.float32)
+    far = np.float32(1e9)
+    for y in range(thread, h, threads):
+        for side in range(2):
+            path[:], last[:] = far, far
+            lowest = np.float32(0)
+            for i in range(w):
+                x = i if side == 0 else w - 1 - i
+                if rgba[y, x, 3] <= 0.5:
+                    last[1 : planes + 1] = 0
+                    lowest = np.float32(0)
+                    continue
+                before = x - 1 if side == 0 else x + 1
+                edge = np.float32(0)
+                if i > 0:
+                    for c in range(3):
+                        edge += abs(rgba[y, x, c] - rgba[y, before, c])
+                farther = lowest + max(jump / (1 + 10 * edge), bend)
+                least = far
+                for p in range(planes):
+                    near = min(last[p], last[p + 2]) + bend
+                    value = curve[y, x, p] + min(min(last[p + 1], near), farther) - lowest
+                    path[p + 1] = value
+                    total[y, x, p] += value
+                    least = min(least, value)
+                lowest = least
+                path, last = last, path
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _winner(curve, inverse_planes, depth, thread, threads):  # pragma: no cover - compiled
+    """The depth (h, w) of the least cost, between the planes by a parabola."""
+    h, w, planes = curve.shape
+    for y in range(thread, h, threads):
         for x in range(w):
-            p = curve[:, x].argmin()
+            p = curve[y, x].argmin()
             offset = np.float32(0)
             if 0 < p < planes - 1:
-                bend = curve[p - 1, x] - 2 * curve[p, x] + curve[p + 1, x]
+                bend = curve[y, x, p - 1] - 2 * curve[y, x, p] + curve[y, x, p + 1]
                 if bend > 1e-9:
-                    offset = 0.5 * (curve[p - 1, x] - curve[p + 1, x]) / bend
+                    offset = 0.5 * (curve[y, x, p - 1] - curve[y, x, p + 1]) / bend
             depth[y, x] = 1 / (inverse_planes[p] + offset * (inverse_planes[1] - inverse_planes[0]))
 
 

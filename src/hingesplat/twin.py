@@ -104,6 +104,11 @@ class Twin:
         """``transforms`` with every joint at its value in input state ``state``."""
         return self.transforms({j.child: j.states[state] for j in self.joints})
 
+    def on_the_way(self, state: int, steps: int) -> list[dict[int, np.ndarray]]:
+        """``transforms`` in ``steps`` even steps from state 0 to another, all joints together."""
+        shares = np.linspace(0, 1, steps)
+        return [self.transforms({j.child: share * j.states[state] for j in self.joints}) for share in shares]
+
     def to_json(self) -> dict[str, Any]:
         return {
             "version": VERSION,

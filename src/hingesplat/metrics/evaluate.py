@@ -173,7 +173,7 @@ def _chamfers(truth: Truth, found: Sequence[FoundPart], found_of_true: dict[int,
 
 def _penetrations(twin: Twin, found: Sequence[FoundPart]) -> dict[str, Any]:
     """Of each mover into the base, all joints going from state 0 to state 1 together; the worst counts."""
-    steps = [twin.transforms({j.child: j.states[1] * s for j in twin.joints}) for s in np.linspace(0, 1, STEPS)]
+    steps = twin.on_the_way(1, STEPS)
     each = {
         p.id: asdict(penetration(found[0].meshes[0], p.meshes[0], [poses[p.id] for poses in steps])) for p in found[1:]
     }
