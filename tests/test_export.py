@@ -433,19 +433,20 @@ def test_collision_hulls_are_convex_cover_the_mesh_and_are_cached(tmp_path: Path
     assert all(h.is_convex and h.is_watertight for h in hulls)
     total = sum(h.volume for h in hulls)
     assert ell.volume * 0.95 < total < ell.volume * 1.15 < ell.convex_hull.volume
-    monkeypatch.setattr("coacd.run_coacd", lambda *a, **k: pytest.fail("cut again"))
+    monkeypatch.setattr("hingesplat.export.solids._convex_pieces", lambda *_: pytest.fail("cut again"))
     again = collision_hulls(ell, tmp_path)
     assert [h.volume for h in again] == pytest.approx([h.volume for h in hulls])
 
 
-def test_when_the_decomposition_fails_the_convex_hull_stands_in(tmp_path: Path, monkeypatch):
-    def fail(*args, **kwargs):
-        raise RuntimeError("no luck")
-
-    monkeypatch.setattr("coacd.run_coacd", fail)
+@pytest.mark.parametrize("end", ["import os; os.abort()", "raise RuntimeError('no luck')"])
+def test_when_the_decomposition_dies_the_convex_hull_stands_in(tmp_path: Path, monkeypatch, caplog, end: str):
+    script = tmp_path / "dies.py"
+    script.write_text(end)
+    monkeypatch.setattr("hingesplat.export.solids.CONVEX", script)
     mesh = box((1, 1, 1), (0, 0, 0), (9, 9, 9))
-    (hull,) = collision_hulls(mesh, tmp_path)
+    (hull,) = collision_hulls(mesh, tmp_path / "cache")
     assert hull.volume == pytest.approx(1.0)
+    assert ("no luck" if "luck" in end else "exit code -6") in caplog.text
 
 
 def gaudy_ball() -> trimesh.Trimesh:

@@ -8,10 +8,12 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from hingesplat.joints import JointPoses, JointResult, JointsConfig, _joints, closest_joint, find_joints
+from hingesplat.chains import closest_joint, parents_of
+from hingesplat.joints import JointPoses, JointResult, JointsConfig, _joints, find_joints
 from hingesplat.poses import part_centres
 from hingesplat.render import move
 from hingesplat.screw import line_distance, prismatic, revolute
+from hingesplat.twin import Joint, JointType, Part, Twin
 from scenes import (
     ANGLE,
     AXIS,
@@ -216,3 +218,38 @@ def test_without_movable_parts_there_is_nothing_to_do() -> None:
     light = torch.zeros((2, len(base), 3))
     result = find_joints(base, np.tile(np.eye(4), (2, 1, 1, 1)), light, made.views, CONFIG)
     assert result.joints == () and result.gaussians is base
+
+
+def test_a_part_hangs_on_another_only_where_its_motion_is_one_joint_there_and_not_on_the_base():
+    rng = np.random.default_rng(0)
+    door = revolute((0, 0, 1), (0.5, 0, 0), 1.1)
+    lever = revolute((0, 1, 0), (0.2, 0.1, 0.1), 0.6)
+    drawer = prismatic((0, -1, 0), 0.3)
+    T = np.stack([np.eye(4), drawer, door @ lever, door])
+    T_state_0 = np.stack([np.tile(np.eye(4), (4, 1, 1)), T])
+    points = [rng.uniform(-0.5, 0.5, (200, 3)) + offset for offset in ([0, 0, 0], [0, 0, 1], [0.2, 0.1, 0], [0, 0, 0])]
+    assert parents_of(T_state_0, points, 1.0) == [0, 3, 0]
+    noise = np.stack([revolute(rng.normal(size=3), rng.normal(size=3), 1e-3) for _ in range(4)])
+    assert parents_of(np.stack([T_state_0[0], noise @ T]), points, 1.0) == [0, 3, 0]
+
+
+def test_two_doors_on_the_base_do_not_hang_on_each_other():
+    T = np.stack([np.eye(4), revolute((0, 0, 1), (0.5, 0, 0), 1.1), revolute((0, 0, 1), (-0.5, 0, 0), -0.8)])
+    T_state_0 = np.stack([np.tile(np.eye(4), (3, 1, 1)), T])
+    points = [np.random.default_rng(k).uniform(-0.5, 0.5, (100, 3)) for k in range(3)]
+    assert parents_of(T_state_0, points, 1.0) == [0, 0]
+
+
+def test_a_chain_of_joints_moves_as_the_twin_made_of_it_does():
+    kinds: list[JointType] = ["revolute", "revolute"]
+    axes, pivots = np.array([[0, 1.0, 0], [0, 0, 1.0]]), np.array([[0.2, 0.1, 0.1], [0.5, 0, 0]])
+    poses = JointPoses(kinds, axes, pivots, np.array([[0.6, 1.1]]), 1.0, [2, 0])
+    R, t = poses.Rt()
+    joints = [
+        Joint(k + 1, poses.parents[k], kinds[k], tuple(axes[k]), tuple(pivots[k]), (0.0, v), (0.0, v))
+        for k, v in enumerate((0.6, 1.1))
+    ]
+    there = Twin(tuple(Part(i, str(i), 0) for i in range(3)), tuple(joints)).at_state(1)
+    for part in range(3):
+        assert R[1, part].detach().numpy() == pytest.approx(there[part][:3, :3], abs=1e-6)
+        assert t[1, part].detach().numpy() == pytest.approx(there[part][:3, 3], abs=1e-6)

@@ -35,16 +35,22 @@ def test_the_fused_kernel_agrees_with_torch_in_float64(size, weight):
     assert (gradient - truth).norm() <= 1e-5 * truth.norm() + 1e-9
 
 
+@pytest.mark.parametrize("known", [False, True])
 @pytest.mark.parametrize("size", [(61, 45), (1, 1), (7, 100)])
-def test_the_fused_depth_variance_agrees_with_torch_in_float64(size):
+def test_the_fused_depth_variance_agrees_with_torch_in_float64(size, known):
     x, y = pair(4, *size)
     g = torch.Generator().manual_seed(3)
     z = 1 + torch.rand(size, generator=g)
     depths = (x[3] * z, x[3] * (z * z + 0.1 * torch.randn(size, generator=g)))
 
+    # Half of the known depths are near what is drawn, the others too far off to count, or not known.
+    where = torch.rand(size, generator=g)
+    depth = torch.where(where < 0.5, z * (1 + 0.03 * (where - 0.25)), torch.where(where < 0.8, 2 * z, 0))
+
     def all_of(dtype):
         inputs = [t.to(dtype).requires_grad_() for t in (x.clone(), *depths)]
-        loss, error = picture_loss(inputs[0], Target.of(y.to(dtype)), 0.2, (inputs[1], inputs[2]), 3.0)
+        target = Target.of(y.to(dtype), depth.to(dtype) if known else None)
+        loss, error = picture_loss(inputs[0], target, 0.2, (inputs[1], inputs[2]), 3.0)
         gradients = torch.autograd.grad(2 * loss, inputs)
         return [loss.detach(), error, *gradients]
 

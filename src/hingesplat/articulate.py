@@ -16,7 +16,8 @@ from hingesplat.optim import GaussianAdam, LearningRates
 from hingesplat.physics import PhysicsConfig, RepelConfig, Repulsion, Targets, one_hot, physics_loss
 from hingesplat.poses import PoseDelta, StateLossConfig, part_centres, state_loss
 from hingesplat.slots import SlotsConfig, living_slots
-from hingesplat.training import Report, averaged, grow, shuffled, training_view
+from hingesplat.stereo import DepthMap
+from hingesplat.training import Report, averaged, grow, shuffled, training_views
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,7 @@ def articulate(
     config: ArticulateConfig,
     *,
     fitted: Sequence[Gaussians] = (),
+    maps: Sequence[Sequence[DepthMap]] = (),
     seed: int = 0,
     report: Report = lambda **_: None,
 ) -> Articulation:
@@ -75,6 +77,7 @@ def articulate(
         T_state_0: (states, parts, 4, 4) first motions.
         views: training photographs of every state.
         fitted: each state's own Gaussians; L_art, L_vector and displacements without parts need them.
+        maps: the depth of every photograph where it is known.
     """
     rng = np.random.default_rng(seed)
     generator = torch.Generator().manual_seed(seed)
@@ -91,7 +94,7 @@ def articulate(
     repulsion = Repulsion(config.repel, extent, generator)
     extra = {"state_sh": (torch.zeros((len(canonical), len(views) - 1, 3)), config.rates.sh)}
     optimiser = GaussianAdam(canonical, config.rates, extent, extra | identity.extra | targets.extra)
-    training = [[training_view(v) for v in state] for state in views]
+    training = training_views(views, maps)
     photographs = shuffled(training, rng)
     statistics = torch.zeros((len(optimiser), 3))
     tell = averaged(report, config.steps)

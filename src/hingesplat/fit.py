@@ -24,7 +24,7 @@ from hingesplat.training import (
     mean_psnr,
     seen_weight,
     shuffled,
-    training_view,
+    training_views,
     view_loss,
 )
 
@@ -138,7 +138,7 @@ def fit(
     if cloud is None:
         cloud = start_cloud(views, maps, config.start_gaussians, rng)
     extent = float((cloud.points.max(0) - cloud.points.min(0)).max())
-    training = [training_view(v) for v in views]
+    (training,) = training_views([views], [maps])
     held_back = training[:: max(len(training) // 4, 2)][:4] if len(training) >= 12 else []
     kept = [v for v in training if not any(v is h for h in held_back)]
     start = start_from_cloud(cloud, extent / 64)

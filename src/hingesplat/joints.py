@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 
 from hingesplat.capture import View
+from hingesplat.chains import closest_joint, parents_of
 from hingesplat.gaussians import Gaussians
 from hingesplat.losses.photometric import photometric
 from hingesplat.optim import GaussianAdam, LearningRates
 from hingesplat.poses import StateLossConfig, draw_state, part_centres, state_loss
-from hingesplat.screw import matrix_to_screw
 from hingesplat.se3 import rotvec_to_matrix
-from hingesplat.training import Report, TrainingView, averaged, shuffled, training_view
+from hingesplat.stereo import DepthMap
+from hingesplat.training import Report, TrainingView, averaged, shuffled, training_views
 from hingesplat.twin import Joint, JointStd, JointType
 
 log = logging.getLogger(__name__)
@@ -61,10 +62,19 @@ class JointPoses:
     """Part poses with one degree of freedom each: an axis, a pivot, and a value a state."""
 
     def __init__(
-        self, types: Sequence[str], axes: np.ndarray, pivots: np.ndarray, values: np.ndarray, extent: float
+        self,
+        types: Sequence[str],
+        axes: np.ndarray,
+        pivots: np.ndarray,
+        values: np.ndarray,
+        extent: float,
+        parents: Sequence[int] = (),
     ) -> None:
-        """``axes`` and ``pivots`` (joints, 3); ``values`` (states − 1, joints), radians or scene units."""
-        self.extent = extent
+        """``axes`` and ``pivots`` (joints, 3); ``values`` (states − 1, joints), radians or scene units.
+
+        ``parents`` are part ids, joint j being that of part j + 1; all the base if none are given.
+        """
+        self.extent, self.parents = extent, list(parents) or [0] * len(types)
         self.revolute = torch.tensor([kind == "revolute" for kind in types])
         basis = []
         for axis in axes:
@@ -100,23 +110,21 @@ class JointPoses:
         turn = pivot - (R @ pivot[..., None])[..., 0]
         t = torch.where(self.revolute[:, None], turn, value[..., None] * axis)
         eye = torch.eye(3).expand(len(value), 1, 3, 3)
-        return torch.cat([eye, R], 1), torch.cat([torch.zeros((len(value), 1, 3)), t], 1)
+        R, t = torch.cat([eye, R], 1), torch.cat([torch.zeros((len(value), 1, 3)), t], 1)
+        return self._on_parents(R, t) if any(self.parents) else (R, t)
 
+    def _on_parents(self, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+        """Every part's motion carried along by that of its parent."""
+        chained = {0: (R[:, 0], t[:, 0])}
 
-def closest_joint(kind: str, T: np.ndarray, centroid: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Axis (3,), pivot (3,) and values (states − 1,) of the joint of one type nearest to motions T (states − 1, 4, 4).
+        def carried(part: int) -> tuple[Tensor, Tensor]:
+            if part not in chained:
+                R_parent, t_parent = carried(self.parents[part - 1])
+                chained[part] = R_parent @ R[:, part], (R_parent @ t[:, part, :, None])[..., 0] + t_parent
+            return chained[part]
 
-    The state that moved most sets the axis; the others get their best value on it.
-    """
-    ends = T[:, :3, :3] @ centroid + T[:, :3, 3]
-    if kind == "prismatic":
-        shifts = ends - centroid
-        axis = shifts[np.linalg.norm(shifts, axis=1).argmax()]
-        axis = axis / max(float(np.linalg.norm(axis)), 1e-12)
-        return axis, centroid, shifts @ axis
-    screws = [matrix_to_screw(M, centroid) for M in T]
-    most = screws[int(np.argmax([s.angle for s in screws]))]
-    return most.axis, most.pivot, np.array([s.angle * np.sign(s.axis @ most.axis or 1) for s in screws])
+        both = [carried(part) for part in range(R.shape[1])]
+        return torch.stack([r for r, _ in both], 1), torch.stack([s for _, s in both], 1)
 
 
 def find_joints(
@@ -126,6 +134,7 @@ def find_joints(
     views: Sequence[Sequence[View]],
     config: JointsConfig,
     *,
+    maps: Sequence[Sequence[DepthMap]] = (),
     seed: int = 0,
     report: Report = lambda **_: None,
 ) -> JointResult:
@@ -135,6 +144,7 @@ def find_joints(
         gaussians: canonical, frame of state 0.
         T_state_0: (states, parts, 4, 4) free rigid motions.
         state_sh: (states, n, 3) colour offsets.
+        maps: the depth of every photograph where it is known.
     """
     rng = np.random.default_rng(seed)
     low, high = np.quantile(gaussians.means.numpy(), [0.002, 0.998], axis=0)
@@ -142,13 +152,16 @@ def find_joints(
     n_parts = T_state_0.shape[1]
     if n_parts == 1:
         return JointResult(gaussians, state_sh, ())
-    training = [[training_view(v) for v in state] for state in views]
+    training = training_views(views, maps)
     centroids = part_centres(gaussians, n_parts).double().numpy()[1:]
+    points = [gaussians.means[gaussians.part == k].double().numpy() for k in range(n_parts)]
+    parents = parents_of(T_state_0, points, extent)
+    T_parent = np.linalg.inv(T_state_0[1:, parents]) @ T_state_0[1:, 1:]
 
     def poses_of(kinds: Sequence[str]) -> JointPoses:
-        start = [closest_joint(k, T_state_0[1:, i + 1], centroids[i]) for i, k in enumerate(kinds)]
+        start = [closest_joint(k, T_parent[:, i], centroids[i]) for i, k in enumerate(kinds)]
         axes, pivots, values = (np.stack(column) for column in zip(*start, strict=True))
-        return JointPoses(kinds, axes, pivots, values.T, extent)
+        return JointPoses(kinds, axes, pivots, values.T, extent, parents)
 
     kinds, confidence = _choose_types(gaussians, state_sh, training, poses_of, n_parts - 1, config, rng)
     poses = poses_of(kinds)
@@ -347,7 +360,7 @@ def _joints(
         joints.append(
             Joint(
                 child=j + 1,
-                parent=0,
+                parent=poses.parents[j],
                 type=kind,
                 axis=(float(axis[0]), float(axis[1]), float(axis[2])),
                 pivot=(float(pivot[0]), float(pivot[1]), float(pivot[2])),
@@ -359,6 +372,3 @@ def _joints(
             )
         )
     return tuple(joints)
-
-
-__all__ = ["JointPoses", "JointResult", "JointsConfig", "closest_joint", "find_joints"]

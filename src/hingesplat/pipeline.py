@@ -387,7 +387,8 @@ def _articulate(run: Run) -> None:
     else:
         config, report = run.config.articulate, run.reporting("articulate")
         seed = run.config.seed
-        moved = articulate(canonical, T_state_0, run.views, config, fitted=fitted, seed=seed, report=report)
+        maps = [_depth(run, t) for t in range(len(run.views))]
+        moved = articulate(canonical, T_state_0, run.views, config, fitted=fitted, maps=maps, seed=seed, report=report)
     extra = {"T_state_0": torch.from_numpy(np.asarray(moved.T_state_0)), "state_sh": moved.state_sh}
     write_tensors(run / "articulation.safetensors", vars(moved.gaussians) | extra)
 
@@ -400,7 +401,8 @@ def _joints(run: Run) -> None:
     joints: tuple[Joint, ...] = ()
     if T_state_0.shape[1] > 1:
         config, report = run.config.joints, run.reporting("joints")
-        found = find_joints(gaussians, T_state_0, state_sh, run.views, config, seed=run.config.seed, report=report)
+        maps, seed = [_depth(run, t) for t in range(len(run.views))], run.config.seed
+        found = find_joints(gaussians, T_state_0, state_sh, run.views, config, maps=maps, seed=seed, report=report)
         gaussians, state_sh, joints = found.gaussians, found.state_sh, found.joints
     gaussians = gaussians.detached()
     ids = [0, *sorted(j.child for j in joints)]

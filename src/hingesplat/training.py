@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from statistics import fmean
 from typing import Protocol
 from weakref import finalize
@@ -17,6 +18,7 @@ from hingesplat.gaussians import Gaussians
 from hingesplat.losses.photometric import Target, picture_loss, psnr
 from hingesplat.optim import GaussianAdam, densify, morton_order
 from hingesplat.render import Placed, rasterize, render
+from hingesplat.stereo import DepthMap
 
 Report = Callable[..., None]
 """Called now and then with ``step, steps, loss, psnr, gaussians``."""
@@ -37,6 +39,8 @@ class TrainingView:
     camera: Camera
     rgba: np.ndarray
     """(h, w, 4) uint8, straight alpha: a window of the photograph, not a copy."""
+    known: DepthMap | None = None
+    """What stereo knows of it."""
     _target: Target | None = None
 
     @property
@@ -45,12 +49,24 @@ class TrainingView:
         if self._target is not None:
             return self._target
         rgba = torch.from_numpy(self.rgba.astype(np.float32) / 255).permute(2, 0, 1)
-        target = Target.of(torch.cat([rgba[:3] * rgba[3:] + 1 - rgba[3:], rgba[3:]]))
+        image = torch.cat([rgba[:3] * rgba[3:] + 1 - rgba[3:], rgba[3:]])
+        target = Target.of(image, None if self.known is None else torch.from_numpy(self._depth()))
         if _kept_bytes + target.nbytes <= KEPT_BYTES:
             _count_kept(target.nbytes)
             finalize(self, _count_kept, -target.nbytes)
             self._target = target
         return target
+
+    def _depth(self) -> np.ndarray:
+        """(h, w) float32: the known depth, of the nearest of its own, coarser pixels."""
+        assert self.known is not None
+        coarse, fine = self.known.camera, self.camera
+        x = coarse.fx * (np.arange(fine.width) + 0.5 - fine.cx) / fine.fx + coarse.cx
+        y = coarse.fy * (np.arange(fine.height) + 0.5 - fine.cy) / fine.fy + coarse.cy
+        height, width = self.known.depth.shape
+        inside = ((x >= 0) & (x < width)) & ((y >= 0) & (y < height))[:, None]
+        column, row = np.clip(x.astype(int), 0, width - 1), np.clip(y.astype(int), 0, height - 1)
+        return np.where(inside, self.known.depth[row][:, column], 0).astype(np.float32)
 
     @property
     def image(self) -> Tensor:
@@ -63,7 +79,7 @@ def _count_kept(nbytes: int) -> None:
     _kept_bytes += nbytes
 
 
-def training_view(view: View, margin: int = 8) -> TrainingView:
+def training_view(view: View, known: DepthMap | None = None, margin: int = 8) -> TrainingView:
     """Crop to the mask's rectangle plus a margin: what lies outside is background in every render, too."""
     alpha = view.rgba[..., 3]
     height, width = alpha.shape
@@ -73,7 +89,17 @@ def training_view(view: View, margin: int = 8) -> TrainingView:
     x0, x1 = max(columns[0] - margin, 0), min(columns[-1] + margin + 1, width)
     y0, y1 = max(rows[0] - margin, 0), min(rows[-1] + margin + 1, height)
     camera = view.camera.cropped(int(x0), int(y0), int(x1 - x0), int(y1 - y0))
-    return TrainingView(camera, view.rgba[y0:y1, x0:x1])
+    return TrainingView(camera, view.rgba[y0:y1, x0:x1], known)
+
+
+def training_views(
+    states: Sequence[Sequence[View]], maps: Sequence[Sequence[DepthMap]] = ()
+) -> list[list[TrainingView]]:
+    """The photographs of every state with what is known of their depth, if anything."""
+    return [
+        [training_view(view, known) for view, known in zip_longest(views, depths)]
+        for views, depths in zip_longest(states, maps, fillvalue=())
+    ]
 
 
 def averaged(report: Report, steps: int) -> Callable[[Tensor, Tensor, int], None]:

@@ -1,13 +1,16 @@
 """Solids out of part meshes: closed, cut into convex pieces, and swept to where they meet something."""
 
 import hashlib
+import json
 import logging
+import subprocess
+import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import coacd
 import manifold3d
 import numpy as np
 import trimesh
@@ -79,6 +82,9 @@ DECOMPOSITION: dict[str, Any] = dict(
 """How CoACD cuts: a look one cut ahead is a third faster than two, and its pieces fit no worse."""
 
 
+CONVEX = Path(__file__).with_name("convex.py")
+
+
 def collision_hulls(mesh: trimesh.Trimesh, cache: Path, *, most: int = 12) -> tuple[trimesh.Trimesh, ...]:
     """Convex pieces that cover a closed mesh (CoACD, seeded); its one convex hull where that fails.
 
@@ -90,26 +96,37 @@ def collision_hulls(mesh: trimesh.Trimesh, cache: Path, *, most: int = 12) -> tu
     file = cache / f"{key}.npz"
     with suppress(OSError, ValueError, EOFError), np.load(file, allow_pickle=False) as data:
         return tuple(_as_trimesh(manifold3d.Manifold.hull_points(data[name])) for name in sorted(data.files))
-    coarse = _as_trimesh(_coarse(mesh))
-    coacd.set_log_level("error")
-    try:
-        pieces = coacd.run_coacd(
-            coacd.Mesh(np.asarray(coarse.vertices, np.float64), np.asarray(coarse.faces, np.int32)),
-            max_convex_hull=most,
-            **DECOMPOSITION,
-        )
-        least = 1e-9 * np.ptp(vertices, axis=0).max() ** 3  # Some pieces are flat.
-        solids = [manifold3d.Manifold.hull_points(np.asarray(points)) for points, _ in pieces]
-        hulls = [_as_trimesh(solid) for solid in solids if solid.volume() > least]
-    except (RuntimeError, ValueError, AssertionError) as e:
-        log.warning("convex decomposition failed (%s); the convex hull stands in", e)
-        hulls = []
+    least = 1e-9 * np.ptp(vertices, axis=0).max() ** 3  # Some pieces are flat.
+    solids = [manifold3d.Manifold.hull_points(points) for points in _convex_pieces(mesh, most)]
+    hulls = [_as_trimesh(solid) for solid in solids if solid.volume() > least]
     hulls = hulls or [mesh.convex_hull]
     with suppress(OSError):  # A folder that cannot be written costs only time.
         cache.mkdir(parents=True, exist_ok=True)
         with whole_file(file) as tmp, tmp.open("wb") as opened:  # Given a name, savez would add a suffix.
             np.savez(opened, allow_pickle=False, **{f"{i:03d}": h.vertices for i, h in enumerate(hulls)})
     return tuple(hulls)
+
+
+def _convex_pieces(mesh: trimesh.Trimesh, most: int) -> list[np.ndarray]:
+    """Vertices (n, 3) of each piece; none, and a warning, where CoACD fails.
+
+    Where it fails on the mesh as it is, it gets the mesh remeshed by itself.
+    """
+    coarse = _as_trimesh(_coarse(mesh))
+    told = ""
+    with tempfile.TemporaryDirectory() as folder:
+        source, target = Path(folder) / "mesh.npz", Path(folder) / "pieces.npz"
+        for more in ({}, {"preprocess_mode": "on", "preprocess_resolution": 40}):
+            options = json.dumps(DECOMPOSITION | {"max_convex_hull": most} | more)
+            vertices, faces = np.asarray(coarse.vertices, np.float64), np.asarray(coarse.faces, np.int32)
+            np.savez(source, allow_pickle=False, vertices=vertices, faces=faces, options=options)
+            done = subprocess.run([sys.executable, CONVEX, source, target], capture_output=True, text=True)
+            if done.returncode == 0:
+                with np.load(target, allow_pickle=False) as data:
+                    return [data[name] for name in data.files]
+            told = done.stderr.strip().rpartition("\n")[2] or f"exit code {done.returncode}"
+    log.warning("convex decomposition failed (%s); the convex hull stands in", told)
+    return []
 
 
 def free_range(

@@ -40,6 +40,8 @@ C1, C2 = 0.01**2, 0.03**2
 """The constants that stabilise SSIM, for a data range of 1."""
 COVERED = 0.5
 """Alpha from which a pixel has a depth."""
+NEAR = 0.02
+"""Share of a known depth within which the drawn one must be to be drawn to it."""
 
 _WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / WINDOW_SIGMA) ** 2)
 _WINDOW /= _WINDOW.sum()
@@ -55,24 +57,27 @@ class Target:
     """(C, height, width) local mean."""
     variance: Tensor
     """(C, height, width) local variance."""
+    depth: Tensor | None = None
+    """(height, width) where the surface is known to be; 0 where it is not."""
 
     @property
     def nbytes(self) -> int:
-        return self.image.nbytes + self.mean.nbytes + self.variance.nbytes
+        depth = 0 if self.depth is None else self.depth.nbytes
+        return self.image.nbytes + self.mean.nbytes + self.variance.nbytes + depth
 
     @staticmethod
-    def of(image: Tensor) -> "Target":
+    def of(image: Tensor, depth: Tensor | None = None) -> "Target":
         """Blur ``image`` (C, height, width) once for all."""
         image = image.detach().contiguous()
         if _fusible(image):
             threads, (mean, variance) = torch.get_num_threads(), (torch.empty_like(image) for _ in range(2))
             flat = (t.numpy().reshape(-1) for t in (image, mean, variance))
             parallel(_mean_and_variance, threads, _BUILD, *flat, tuple(image.shape))
-            return Target(image, mean, variance)
+            return Target(image, mean, variance, depth)
         exact = image.double()
         mean = _blur_once(exact)
         variance = _blur_once(exact * exact) - mean * mean
-        return Target(image, mean.to(image), variance.to(image))
+        return Target(image, mean.to(image), variance.to(image), depth)
 
 
 def photometric(image: Tensor, target: Target, ssim_weight: float = 0.2) -> Tensor:
@@ -110,18 +115,22 @@ def picture_loss(
     difference = image - target.image
     loss = (1 - ssim_weight) * difference.abs().mean() + ssim_weight * (1 - ssim_map(image, target).mean())
     if depths is not None:
-        loss = loss + variance_weight * depth_variance(image[3], *depths)
+        loss = loss + variance_weight * depth_variance(image[3], *depths, target.depth)
     return loss, difference.detach().square().mean((1, 2))
 
 
-def depth_variance(alpha: Tensor, depth: Tensor, squared_depth: Tensor) -> Tensor:
+def depth_variance(alpha: Tensor, depth: Tensor, squared_depth: Tensor, known: Tensor | None = None) -> Tensor:
     """Mean over covered pixels of the variance of depth along the ray, scene units squared; differentiable.
 
-    All (height, width), blended: ``alpha`` Σ w, ``depth`` Σ w·z, ``squared_depth`` Σ w·z².
+    It is the variance about the mean, or about the ``known`` depth where the mean is within NEAR of that: one that is
+    farther off may be wrong. All (height, width), blended: ``alpha`` Σ w, ``depth`` Σ w·z, ``squared_depth`` Σ w·z².
     """
     covered = alpha > COVERED
     weight = torch.where(covered, alpha, 1)
-    variance = (squared_depth / weight - (depth / weight).square()).clamp_min(0)
+    about = mean = depth / weight
+    if known is not None:
+        about = torch.where((known - mean).abs() < NEAR * known, known, mean)
+    variance = (squared_depth / weight - 2 * about * mean + about.square()).clamp_min(0)
     return (variance * covered).mean()
 
 
@@ -182,7 +191,7 @@ def ssim_map(x: Tensor, target: Target) -> Tensor:
 _BUILD = Build([Path(__file__)])
 _W0, _W1, _W2, _W3, _W4, _W5 = (np.float32(w) for w in _WINDOW[RADIUS:])
 _C1, _C2 = np.float32(C1), np.float32(C2)
-_0, _1, _2, _COVERED = np.float32(0), np.float32(1), np.float32(2), np.float32(COVERED)
+_0, _1, _2, _COVERED, _NEAR = (np.float32(x) for x in (0, 1, 2, COVERED, NEAR))
 _MARGIN = 16  # zero columns beside a padded row
 _STEP = 16  # rows that go through each step at a time
 _LAG = 2 * RADIUS
@@ -430,20 +439,21 @@ def _loss_and_gradient(build, x, y, mean, variance, size, weight, sums, gradient
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def _variance_and_gradient(alpha, depth, squared_depth, weight, g_alpha, g_depth, g_squared, sums, t, threads):
+def _variance_and_gradient(alpha, depth, squared_depth, known, weight, g_alpha, g_depth, g_squared, sums, t, threads):
     """``depth_variance`` times weight: its gradients, added to ``g_alpha``, and sums[t] for a thread's share."""
     n, total = len(alpha), 0.0
     mine = slice(t * n // threads, (t + 1) * n // threads)
-    alpha, depth, squared_depth = alpha[mine], depth[mine], squared_depth[mine]
+    alpha, depth, squared_depth, known = alpha[mine], depth[mine], squared_depth[mine], known[mine]
     g_alpha, g_depth, g_squared = g_alpha[mine], g_depth[mine], g_squared[mine]
     for i in range(len(alpha)):
         inverse = _1 / alpha[i] if alpha[i] > _COVERED else _0
         mean, square = depth[i] * inverse, squared_depth[i] * inverse
-        variance = square - mean * mean
+        about = known[i] if abs(known[i] - mean) < _NEAR * known[i] else mean
+        variance = square - _2 * about * mean + about * about
         scale = weight / np.float32(n) * inverse if variance > _0 else _0
         total += max(variance, _0)
-        g_alpha[i] += scale * (_2 * mean * mean - square)
-        g_depth[i] = _0 - scale * _2 * mean
+        g_alpha[i] += scale * (_2 * about * mean - square)
+        g_depth[i] = _0 - scale * _2 * about
         g_squared[i] = scale
     sums[t] = weight * total / n
 
@@ -462,8 +472,9 @@ class _Fused(torch.autograd.Function):
         if depth is not None:
             g_depth, g_squared, more = np.empty(size[1:], np.float32), np.empty(size[1:], np.float32), np.zeros(threads)
             alpha, g_alpha = (a.reshape(size[0], -1)[3] for a in (flat[0], gradient))
-            known = (alpha, _flat(depth), _flat(squared_depth), np.float32(variance_weight))
-            parallel(_variance_and_gradient, threads, *known, g_alpha, g_depth.reshape(-1), g_squared.reshape(-1), more)
+            known = np.zeros_like(alpha) if target.depth is None else _flat(target.depth)
+            given = (alpha, _flat(depth), _flat(squared_depth), known, np.float32(variance_weight))
+            parallel(_variance_and_gradient, threads, *given, g_alpha, g_depth.reshape(-1), g_squared.reshape(-1), more)
             loss += more.sum()
             gradients += [g_depth, g_squared]
         ctx.save_for_backward(*map(torch.from_numpy, gradients))
