@@ -180,7 +180,7 @@ def test_a_joint_that_was_refined_backwards_is_turned_round() -> None:
     values = np.array([[0.2], [-0.9]])
     for kind in ("revolute", "prismatic"):
         p = JointPoses([kind], SLANT[None], POINT[None], values, 1.0)
-        (joint,) = _joints([kind], p, made.gaussians, np.ones(1), None, np.ones(1, int), 1)
+        (joint,) = _joints([kind], p, made.gaussians, np.ones(1), None, np.ones(1, int), 1, 0.01)
         np.testing.assert_allclose(joint.states, [0, -0.2, 0.9], atol=1e-6)
         np.testing.assert_allclose(joint.limits, [-0.2, 0.9], atol=1e-6)
         for state, value in enumerate([0.0, 0.2, -0.9]):
@@ -199,6 +199,21 @@ def test_deviations_are_finite_positive_and_small(kind: Kind) -> None:
         assert joint.std.pivot is None
     assert joint.confidence is not None and 0.5 <= joint.confidence <= 1
     assert "views" in joint.verdict
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+def test_no_joint_is_surer_than_a_part_of_a_pixel(kind: Kind) -> None:
+    """Photographs may agree perfectly; labels and highlights are wrong in all of them alike."""
+    made = scene(kind, 48, 0.1)
+    axis, pivot, value = (AXIS, PIVOT, ANGLE) if kind == "revolute" else (FORWARD, np.zeros(3), SLIDE)
+    p = JointPoses([kind], np.asarray(axis)[None], np.asarray(pivot)[None], np.array([[value]]), 1.0)
+    coarse, fine = (
+        _joints([kind], p, made.gaussians, np.ones(1), np.zeros((1, 5)), np.ones(1, int), 1, pixel)[0].std
+        for pixel in (0.02, 0.01)
+    )
+    assert coarse.axis_deg and fine.axis_deg and coarse.axis_deg == pytest.approx(2 * fine.axis_deg)
+    assert coarse.motion and fine.motion and coarse.motion == pytest.approx(2 * fine.motion)
+    assert (coarse.pivot is None) == (kind == "prismatic") and 0.0005 <= fine.motion <= 0.02
 
 
 def test_deviations_can_be_skipped_and_the_seed_decides() -> None:

@@ -553,7 +553,7 @@ def test_the_one_moving_part_is_found(kind: Literal["revolute", "prismatic"], de
     )
     assert angle_between(T, T_true) < 1.5  # Pictures of 96 pixels; seeds scatter from 0.5 to 1.2.
     centre = made.gaussians.means[made.gaussians.part == 1].mean(0).double().numpy()[None]
-    assert np.linalg.norm(moved(centre, T) - moved(centre, T_true)) < 0.015  # A surface is 0.012 thick.
+    assert np.linalg.norm(moved(centre, T) - moved(centre, T_true)) < 0.02  # A surface is 0.012 thick.
     for labels in found.labels:
         assert labels.shape == (len(made.gaussians),)
         assert (labels == made.gaussians.part.numpy()).mean() > 0.9

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
@@ -73,10 +74,12 @@ def propose(
     extent: float,
     config: HypothesesConfig,
     rng: np.random.Generator,
+    after: np.ndarray | None = None,
 ) -> list[Motion]:
     """Hypotheses, as motions from state 0 to 1, from every group of seeds of both states.
 
-    ``fresh`` are the points of each state that the other does not show in the same place.
+    ``fresh`` are the points of each state that the other does not show in the same place; ``after`` (4, 4) is the
+    motion of another part, on which these seeds hang.
     """
     groups = []
     for s in (0, 1):
@@ -92,7 +95,8 @@ def propose(
         p, c = surfaces[s].points[chosen], surfaces[s].colours[chosen]
         # Slides get a hearing of their own: with three numbers fewer they are seldom the luckiest fit.
         for kind in ("revolute", "prismatic"):
-            found = scan(p, blurred[s][chosen], directions, coarse[1 - s], kinds=(kind,), keep=4)
+            then = after if s == 0 or after is None else np.linalg.inv(after)
+            found = scan(p, blurred[s][chosen], directions, coarse[1 - s], kinds=(kind,), after=then, keep=4)
             for motion in found:
                 if motion.score > max(0.1, 0.7 * found[0].score):
                     # Compare hypotheses at their best: on the grid a true one may be 3° off and lose to a lucky one.
@@ -160,11 +164,16 @@ def refine_motion(
     values = motion.value + np.linspace(-1, 1, 9) * (
         np.radians(spread_deg) if motion.kind == "revolute" else 2 * volume.voxel
     )
-    kinds = (motion.kind,)
-    (straight,) = scan(points, colours, motion.axis[None], volume, kinds=kinds, values=values, near=motion, keep=1)
-    (best,) = scan(points, colours, tilted, volume, kinds=kinds, values=values, near=motion, keep=1)
+    told: dict[str, Any] = dict(kinds=(motion.kind,), values=values, near=motion, after=_carried(motion), keep=1)
+    (straight,) = scan(points, colours, motion.axis[None], volume, **told)
+    (best,) = scan(points, colours, tilted, volume, **told)
     # The volume is coarse: an axis is tilted only for a clear gain, and the photographs settle the rest later.
     return best if best.score > straight.score + 0.02 else straight
+
+
+def _carried(motion: Motion) -> np.ndarray | None:
+    """``motion.after`` where it is any motion."""
+    return None if np.array_equal(motion.after, np.eye(4)) else motion.after
 
 
 def refit(
@@ -223,6 +232,7 @@ def polished(trials: Sequence[Motion], mine: Surface, other: Surface, extent: fl
 def registered(motion: Motion, source: Cloud, target: Cloud, extent: float) -> Motion:
     """The motion after registration, of the same kind again: what another degree of freedom took up is dropped."""
     T = register(source, target, motion.T, extent, turn=motion.kind == "revolute")
+    T = np.linalg.inv(motion.after) @ T
     centroid = source.points.mean(0)
     if motion.kind == "prismatic":
         shift = T[:3, :3] @ centroid + T[:3, 3] - centroid

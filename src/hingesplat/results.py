@@ -342,6 +342,8 @@ def _section(page: Path, rows: Sequence[Row], out: Path) -> list[str]:
     by_method = grouped(rows, "method")
     text = ["Medians over all joints, parts and runs; in brackets the worst.", ""]
     text += markdown([overview(mine) for mine in by_method.values()])
+    if calibration := _calibration(measured(by_method.get(("hingesplat",), []))):
+        text += ["", calibration]
     if beside := _side_by_side(by_method):
         text += ["", *beside]
     for (method,), mine in by_method.items():
@@ -356,6 +358,18 @@ def _section(page: Path, rows: Sequence[Row], out: Path) -> list[str]:
     if pictures:
         text += ["", "### The worst of hingesplat", *pictures]
     return text
+
+
+def _calibration(rows: Sequence[Row]) -> str:
+    """How often the truth lies within two of the standard deviations that the twins of these runs name."""
+    joints = [j for row in rows for j in row["metrics"]["joints"] if j["type_true"] == j["type_found"]]
+    shares = []
+    for name, keys in (("axis", ["axis_deg"]), ("pivot", ["pivot"]), ("motion", ["motion_deg", "motion_units"])):
+        pairs = [(j[key], j.get("std", {}).get(key)) for j in joints for key in keys]
+        within = [error <= 2 * std for error, std in pairs if error is not None and std is not None]
+        if within:
+            shares.append(f"{name} {sum(within)} of {len(within)}")
+    return f"The truth lies within two of hingesplat's standard deviations: {', '.join(shares)}." if shares else ""
 
 
 def _side_by_side(by_method: dict[tuple, list[Row]]) -> list[str]:

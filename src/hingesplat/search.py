@@ -5,8 +5,8 @@ score volume of the other state (high on surfaces that were not there before, ne
 positions that cross the object. Nothing is matched by appearance alone, so repeating texture cannot mislead it far.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -246,24 +246,34 @@ class Motion:
     """Radians or scene units."""
     score: float
     """Mean score of the seeds, at most 1."""
+    after: np.ndarray = field(default_factory=lambda: np.eye(4))
+    """(4, 4) where the motion of another part, on which this one hangs, takes it then."""
 
     @staticmethod
     def of(known: Mapping[str, Any]) -> "Motion":
         """From a JSON object of its fields."""
-        lists = {name: np.asarray(known[name], np.float64) for name in ("axis", "pivot")}
+        lists = {name: np.asarray(known[name], np.float64) for name in ("axis", "pivot", "after")}
         return Motion(known["kind"], value=known["value"], score=known["score"], **lists)
 
     @property
     def T(self) -> np.ndarray:
         """4×4 from this state's configuration to the other's."""
         if self.kind == "prismatic":
-            return prismatic(self.axis, self.value)
-        return revolute(self.axis, self.pivot, self.value)
+            return self.after @ prismatic(self.axis, self.value)
+        return self.after @ revolute(self.axis, self.pivot, self.value)
 
 
 def inverted(motion: Motion) -> Motion:
-    """The way back."""
-    return replace(motion, value=-motion.value)
+    """The way back: the joint where the other part's motion has taken it, then that motion undone."""
+    axis, pivot = motion.after[:3, :3] @ motion.axis, moved(motion.pivot[None], motion.after)[0]
+    return replace(motion, axis=axis, pivot=pivot, value=-motion.value, after=np.linalg.inv(motion.after))
+
+
+def carrier_of(motion: Motion, motions: Sequence[Motion]) -> int | None:
+    """Index of the motion that carries this one on; None for one that hangs on the base."""
+    if np.array_equal(motion.after, np.eye(4)):
+        return None
+    return int(np.argmin([np.inf if m is motion else np.abs(m.T - motion.after).max() for m in motions]))
 
 
 def scan(
@@ -275,6 +285,7 @@ def scan(
     kinds: tuple[str, ...] = ("revolute", "prismatic"),
     values: np.ndarray | None = None,
     near: Motion | None = None,
+    after: np.ndarray | None = None,
     keep: int = 12,
 ) -> list[Motion]:
     """The best distinct motions of seeds (m, 3) with colours (m, 3), each about one of ``directions`` (d, 3).
@@ -283,9 +294,20 @@ def scan(
         values: angles (radians) or slides (scene units) to try, of the one kind in ``kinds``; None tries ±5° to ±150°
             and every slide that stays within the object.
         near: keep a revolute axis within four voxels of this motion's pivot.
+        after: (4, 4) what moves the seeds on, once their joint has moved them.
 
     Distinct: their mean displacement of the seeds differs by more than three voxels.
     """
+    if after is not None:  # Where it takes them first, the same joint stands elsewhere.
+        R = after[:3, :3]
+        if near is not None:
+            near = replace(near, pivot=moved(near.pivot[None], after)[0])
+        seeds = moved(seeds, after)
+        found = scan(seeds, colours, directions @ R.T, volume, kinds=kinds, values=values, near=near, keep=keep)
+        back = np.linalg.inv(after)
+        return [
+            replace(m, axis=m.axis @ R, pivot=moved(m.pivot[None], back)[0], after=np.asarray(after)) for m in found
+        ]
     directions = np.ascontiguousarray(directions, dtype=np.float64)
     grid = (volume.origin.astype(np.float32), volume.voxel, volume.score, volume.colour)
     seeds32, colours32 = seeds.astype(np.float32), colours.astype(np.float32)

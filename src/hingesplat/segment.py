@@ -13,14 +13,19 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from hingesplat.capture import View
+from hingesplat.chains import misfit
 from hingesplat.gaussians import Gaussians
 from hingesplat.hypotheses import HypothesesConfig, consensus, distinct, polished, propose, refit
 from hingesplat.labelling import Labelling, seed_costs
 from hingesplat.pieces import reattach_fragments, split_pieces
-from hingesplat.search import Motion, ScoreVolume, inverted, novelty, scan, score_volume
+from hingesplat.search import Motion, ScoreVolume, carrier_of, inverted, novelty, scan, score_volume
 from hingesplat.stereo import DepthMap
 from hingesplat.surface import Surface, bounds, surface_of, thin
 from hingesplat.visibility import FREE, HIDDEN, ask
+
+
+HANGING = 0.02
+"""Mean error of the best joint on the base, as a fraction of the extent, from which a part may hang on another."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +48,8 @@ class SegmentConfig:
     """A seed that a motion explains worse than this counts as unexplained."""
     part_cost: float = 45.0
     """Description length of one more part, in points (a point stands for 0.03² of the extent's square)."""
+    hanging_cost: float = 22.0
+    """The same where something is left that no joint on the base explains: parts that hang on others are small."""
     min_part_seeds: int = 25
     """A part must own at least this many seeds."""
     hypotheses: HypothesesConfig = field(default_factory=HypothesesConfig)
@@ -143,21 +150,37 @@ def segment(
 
     rows = [thin(surface.points, 2 * config.spacing * extent, rng) for surface in surfaces]
     problem = Labelling.of((surfaces[0].rows(rows[0]), surfaces[1].rows(rows[1])), extent)
-    for _ in range(config.rounds):
-        kept, owned = problem.choose([m.T for m in chosen], config.part_cost, parts)
-        chosen = [
-            refit(
-                chosen[k],
-                (rows[0][owned[0] == i + 1], rows[1][owned[1] == i + 1]),
-                surfaces,
-                fresh,
-                fine,
-                extent,
-                config.hypotheses,
-                rng,
-            )
-            for i, k in enumerate(kept)
+
+    def settled(candidates: list[Motion], price: float) -> list[Motion]:
+        """Those of the candidates that there are, refined on what they own."""
+        for _ in range(config.rounds):
+            kept, owned = problem.choose([m.T for m in candidates], price, parts)
+            owners = [(rows[0][owned[0] == i + 1], rows[1][owned[1] == i + 1]) for i in range(len(kept))]
+            candidates = [
+                refit(candidates[k], own, surfaces, fresh, fine, extent, config.hypotheses, rng)
+                for k, own in zip(kept, owners, strict=True)
+            ]
+        return candidates
+
+    chosen = settled(chosen, config.part_cost)
+    # What no joint on the base explains may hang on another part.
+    left = np.flatnonzero(costs_of(chosen).min(1) >= config.explained_cost) if chosen else np.zeros(0, int)
+    stray = [judging[0][left[left < len(judging[0])]], judging[1][left[left >= len(judging[0])] - len(judging[0])]]
+    hanging: list[Motion] = []
+    if len(left) >= config.min_part_seeds:
+        for carrier in chosen:
+            hanging += propose(surfaces, fresh, stray, coarse, fine, extent, config.hypotheses, rng, carrier.T)
+    if hanging:
+        agree = costs_of(hanging)[left] < config.hypotheses.consensus_cost
+        where = np.concatenate([surfaces[s].points[stray[s]] for s in (0, 1)])
+        hanging = [
+            m
+            for m, a in zip(hanging, agree.T, strict=True)
+            if a.sum() >= config.min_part_seeds and misfit(m.T[None], where[a]) > HANGING * extent
         ]
+        more = settled([*chosen, *hanging], config.hanging_cost)
+        if any(carrier_of(motion, more) is not None for motion in more):
+            chosen = more
     problem = Labelling.of(surfaces, extent)
     owned = problem.labels([m.T for m in chosen])
     if parts is None:
@@ -192,28 +215,31 @@ def track(
     extent = float((high - low).max())
     volume = score_volume(there.points, there.colours, there.sight, here.sight, low, high, 2 * config.cells)
     own_label = labels[KDTree(gaussians[0].means.numpy()).query(here.points)[1]]
-    found = []
-    for k, motion in enumerate(motions):
+    on_base = [k for k, motion in enumerate(motions) if carrier_of(motion, motions) is None]
+    found: dict[int, np.ndarray] = {}
+    for k in sorted(range(len(motions)), key=lambda k: k not in on_base):
+        motion, carrier = motions[k], carrier_of(motions[k], motions)
+        after = None if carrier is None else found[carrier]
         own = np.flatnonzero(own_label == k + 1)
         if len(own) < config.min_part_seeds:
-            found.append(np.eye(4))
+            found[k] = np.eye(4) if after is None else after
             continue
+        motion = replace(motion, value=0.0, after=np.eye(4) if after is None else after)
         mine = here.rows(rng.choice(own, min(2 * config.hypotheses.seeds_per_search, len(own)), replace=False))
         reach = np.radians(150) if motion.kind == "revolute" else extent / 2
-        values = np.linspace(-reach, reach, 201)
         trials = scan(
             mine.points,
             mine.colours,
             motion.axis[None],
             volume,
             kinds=(motion.kind,),
-            values=values,
+            values=np.linspace(-reach, reach, 201),
             near=motion,
+            after=after,
             keep=6,
         )
-        best = polished([replace(motion, value=0.0), *trials], mine, there, extent)
-        found.append(best.T)
-    return found
+        found[k] = polished([motion, *trials], mine, there, extent).T
+    return [found[k] for k in range(len(motions))]
 
 
 def spread_labels(points: np.ndarray, surface: Surface, labels: np.ndarray) -> np.ndarray:

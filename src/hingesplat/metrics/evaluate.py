@@ -15,7 +15,7 @@ from hingesplat.metrics.motion import joint_errors
 from hingesplat.metrics.surface import SAMPLES, chamfer, clean, match, overlap, penetration, sample
 from hingesplat.metrics.truth import Truth, load_mesh, load_truth
 from hingesplat.metrics.views import score_views
-from hingesplat.twin import Twin
+from hingesplat.twin import Joint, Twin
 
 SEEDS = (0, 1, 2)
 MATCH_SAMPLES = 4000
@@ -138,7 +138,17 @@ def _joint(truth: Truth, index: int, twin: Twin, found_of_true: dict[int, int]) 
         "type_true": joint.type,
         "type_found": found.type if found else None,
         **joint_errors(joint, found, T_found, centre),
+        "std": _stds(found),
     }
+
+
+def _stds(joint: Joint | None) -> dict[str, float | None]:
+    """What the twin says of its errors, under the names that these have."""
+    if joint is None or joint.std.motion is None:
+        return {}
+    turn = joint.type == "revolute"
+    motion = {"motion_deg": float(np.degrees(joint.std.motion))} if turn else {"motion_units": joint.std.motion}
+    return {"axis_deg": joint.std.axis_deg, "pivot": joint.std.pivot, **motion}
 
 
 def _chamfers(truth: Truth, found: Sequence[FoundPart], found_of_true: dict[int, int]) -> dict[str, Any]:
