@@ -1,5 +1,6 @@
 """The exhaustive search for one-degree motions."""
 
+import json
 from functools import cache
 
 import numpy as np
@@ -7,7 +8,17 @@ import pytest
 
 from hingesplat.gaussians import SH_C0
 from hingesplat.screw import prismatic, revolute
-from hingesplat.search import HIDDEN_SCORE, Motion, ScoreVolume, both_signs, novelty, scan, score_volume
+from hingesplat.search import (
+    HIDDEN_SCORE,
+    Motion,
+    ScoreVolume,
+    both_signs,
+    carrier_of,
+    inverted,
+    novelty,
+    scan,
+    score_volume,
+)
 from hingesplat.surface import Surface, bounds, surface_of
 from scenes import (
     ANGLE,
@@ -41,6 +52,33 @@ def test_motion_agrees_with_its_screw() -> None:
     axis, pivot = np.array([0.6, 0.0, 0.8]), np.array([0.1, 0.2, 0.3])
     np.testing.assert_allclose(Motion("revolute", axis, pivot, 0.7, 1.0).T, revolute(axis, pivot, 0.7))
     np.testing.assert_allclose(Motion("prismatic", axis, pivot, -0.7, 1.0).T, prismatic(axis, -0.7))
+
+
+def test_a_motion_on_another_part_is_its_joint_and_then_that_of_the_part_both_ways() -> None:
+    carrier = revolute((0, 0, 1), (0.5, 0, 0), 1.1)
+    axis, pivot = np.array([0.6, 0.0, 0.8]), np.array([0.1, 0.2, 0.3])
+    for kind, joint in (("revolute", revolute(axis, pivot, 0.7)), ("prismatic", prismatic(axis, 0.7))):
+        motion = Motion(kind, axis, pivot, 0.7, 1.0, carrier)
+        np.testing.assert_allclose(motion.T, carrier @ joint)
+        np.testing.assert_allclose(inverted(motion).T @ motion.T, np.eye(4), atol=1e-12)
+        np.testing.assert_allclose(inverted(inverted(motion)).axis, axis, atol=1e-12)
+        again = Motion.of(json.loads(json.dumps({k: np.asarray(v).tolist() for k, v in vars(motion).items()})))
+        np.testing.assert_allclose(again.T, motion.T)
+        base = Motion("revolute", np.array([0.0, 0, 1]), np.array([0.5, 0, 0]), 1.1, 1.0)
+        assert carrier_of(motion, [motion, base]) == 1 and carrier_of(base, [motion, base]) is None
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+def test_scan_looks_where_another_part_takes_the_seeds_then(kind: str) -> None:
+    """The world of state 0 as it was before a motion that is known: the same joint is found, in the frame of then."""
+    a, _, volume, moves = prepared(kind)
+    rows = np.random.default_rng(0).choice(np.flatnonzero(moves), 64, replace=False)
+    after = revolute((0.0, 1.0, 0.0), (0.2, 0.0, 0.1), 0.4)
+    seeds, colours = displaced(a.points[rows], np.linalg.inv(after)), a.blurred()[rows]
+    T_true = (revolute(AXIS, PIVOT, ANGLE) if kind == "revolute" else prismatic(FORWARD, SLIDE)) @ after
+    best = scan(seeds, colours, np.eye(3) @ after[:3, :3], volume, after=after, keep=6)[0]
+    error = np.linalg.norm(displaced(seeds, best.T) - displaced(seeds, T_true), axis=1).mean()
+    assert best.kind == kind and error < 1.5 * volume.voxel
 
 
 def test_both_signs() -> None:

@@ -162,6 +162,25 @@ def test_depth_is_found_between_the_planes() -> None:
     assert share(np.abs(depth - DISTANCE) < step) > 0.9
 
 
+def test_a_plain_strip_takes_its_depth_from_both_sides() -> None:
+    def striped(camera: Camera) -> Picture:
+        picture = wall(camera)
+        x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx * DISTANCE + camera.centre[0]
+        picture.rgba[:, np.abs(x) < 0.25, :3] = 0.5
+        return picture
+
+    others = [striped(facing(x, y)) for x, y in ((0.2, 0.0), (-0.2, 0.05), (0.0, 0.2))]
+    target = striped(facing(0))
+    strip = (target.rgba[..., :3] == 0.5).all(-1)
+    step = np.diff(PLANES)[np.searchsorted(PLANES, DISTANCE) - 1]
+
+    def right(config: StereoConfig) -> float:
+        return share((np.abs(sweep(target, others, PLANES, config) - DISTANCE) < step)[strip])
+
+    assert 0.05 < strip.mean() < 0.6
+    assert right(replace(SMALL, bend=0, jump=0)) < 0.7 < 0.8 < right(SMALL)
+
+
 def test_pictures_that_show_something_else_are_outvoted() -> None:
     others = [wall(facing(0.2)), wall(facing(-0.2))]
     rng = np.random.default_rng(0)

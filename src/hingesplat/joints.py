@@ -24,8 +24,8 @@ from hingesplat.twin import Joint, JointStd, JointType
 log = logging.getLogger(__name__)
 
 ACROSS, ALONG = 0.13, 0.05
-"""What photographs agree on and is wrong all the same (a label, a highlight): of a pixel's size on the object, for places
-across a hinge line and turns about it, and for directions and slides. Taken from made objects, docs/results.md."""
+"""Errors that all photographs share (a label, a highlight), in pixels on the object: of places across a hinge line and
+turns about it, and of directions and slides. Taken from the made objects of docs/results.md."""
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,6 @@ from hingesplat.stereo import DepthMap
 from hingesplat.surface import Surface, bounds, surface_of, thin
 from hingesplat.visibility import FREE, HIDDEN, ask
 
-
 HANGING = 0.02
 """Mean error of the best joint on the base, as a fraction of the extent, from which a part may hang on another."""
 
