@@ -1,22 +1,25 @@
 """Motions that may be those of the parts: from every patch of seeds the likeliest, refined on all that agree."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
+from hingesplat.chains import misfit
 from hingesplat.labelling import seed_costs
 from hingesplat.register import register
 from hingesplat.screw import matrix_to_screw
 from hingesplat.se3 import moved
-from hingesplat.search import Motion, ScoreVolume, inverted, scan
+from hingesplat.search import BASE, Motion, ScoreVolume, inverted, scan
 from hingesplat.stereo import Cloud
 from hingesplat.surface import Surface, components
 
 PATCH = 60
 """Seeds of a large piece for each patch that may be a part of its own."""
+HANGING = 0.02
+"""Mean error of the best joint on the base, as a fraction of the extent, from which a part may hang on another."""
 PROMISING = 0.6
 """A hypothesis is worth as much as it explains its seeds better than this."""
 
@@ -74,7 +77,7 @@ def propose(
     extent: float,
     config: HypothesesConfig,
     rng: np.random.Generator,
-    after: np.ndarray | None = None,
+    after: np.ndarray = BASE,
 ) -> list[Motion]:
     """Hypotheses, as motions from state 0 to 1, from every group of seeds of both states.
 
@@ -95,7 +98,7 @@ def propose(
         p, c = surfaces[s].points[chosen], surfaces[s].colours[chosen]
         # Slides get a hearing of their own: with three numbers fewer they are seldom the luckiest fit.
         for kind in ("revolute", "prismatic"):
-            then = after if s == 0 or after is None else np.linalg.inv(after)
+            then = after if s == 0 else np.linalg.inv(after)
             found = scan(p, blurred[s][chosen], directions, coarse[1 - s], kinds=(kind,), after=then, keep=4)
             for motion in found:
                 if motion.score > max(0.1, 0.7 * found[0].score):
@@ -105,6 +108,39 @@ def propose(
                     motion = polished([motion], surfaces[s].rows(chosen), fresh[1 - s], extent)
                     pool.append(motion if s == 0 else inverted(motion))
     return pool
+
+
+def propose_hanging(
+    carriers: Sequence[Motion],
+    costs_of: Callable[[Sequence[Motion]], np.ndarray],
+    surfaces: tuple[Surface, Surface],
+    fresh: Sequence[Surface],
+    seeds: Sequence[np.ndarray],
+    coarse: Sequence[ScoreVolume],
+    fine: Sequence[ScoreVolume],
+    extent: float,
+    config: HypothesesConfig,
+    rng: np.random.Generator,
+) -> list[Motion]:
+    """Hypotheses for seeds that no joint on the base explains: joints on the parts that the carriers move.
+
+    Only motions that no joint on the base comes near; ``costs_of`` gives the (seeds, motions) costs of these seeds.
+    """
+    if sum(map(len, seeds)) < config.min_points:
+        return []
+    pool: list[Motion] = []
+    for carrier in carriers:
+        pool += propose(surfaces, fresh, seeds, coarse, fine, extent, config, rng, carrier.T)
+    if not pool:
+        return []
+    points = np.concatenate([surfaces[s].points[seeds[s]] for s in (0, 1)])
+    agree = (costs_of(pool) < config.consensus_cost).T
+    enough = [bool(a.sum() >= config.min_points) for a in agree]
+    return [
+        m
+        for m, a, many in zip(pool, agree, enough, strict=True)
+        if many and misfit(m.T[None], points[a]) > HANGING * extent
+    ]
 
 
 def consensus(
@@ -164,16 +200,11 @@ def refine_motion(
     values = motion.value + np.linspace(-1, 1, 9) * (
         np.radians(spread_deg) if motion.kind == "revolute" else 2 * volume.voxel
     )
-    told: dict[str, Any] = dict(kinds=(motion.kind,), values=values, near=motion, after=_carried(motion), keep=1)
+    told: dict[str, Any] = dict(kinds=(motion.kind,), values=values, near=motion, after=motion.after, keep=1)
     (straight,) = scan(points, colours, motion.axis[None], volume, **told)
     (best,) = scan(points, colours, tilted, volume, **told)
     # The volume is coarse: an axis is tilted only for a clear gain, and the photographs settle the rest later.
     return best if best.score > straight.score + 0.02 else straight
-
-
-def _carried(motion: Motion) -> np.ndarray | None:
-    """``motion.after`` where it is any motion."""
-    return None if np.array_equal(motion.after, np.eye(4)) else motion.after
 
 
 def refit(

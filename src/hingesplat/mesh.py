@@ -44,7 +44,7 @@ class MeshConfig:
     """Voxels along the longest side of each part's own box."""
     truncation: float = 2.5
     """Depth of the band behind a surface, voxels; at most half of the thinnest wall."""
-    reach: float = 0.03
+    reach: float = 0.04
     """How far behind its surface unseen space belongs to a part in any case; fraction of its longest side."""
     spread: float = 0.02
     """Pixels whose blended depths deviate by more than this (fraction of the scene) are not used."""
@@ -145,7 +145,7 @@ def _solids(
     """Distances of every part that was seen, no two parts in one place.
 
     What was seen stays before what was guessed, and the base gives way to its movers: a mover's guess ends where the
-    base was seen, and all that a mover passes through on its way is empty, as if it had been seen to be.
+    base was seen, and all that a mover passes through on its way is empty.
     """
     grids, surfaces = {}, {}
     for i in views:
@@ -164,10 +164,6 @@ def _solids(
         guess = np.maximum(mover.distance, np.minimum(taken, 1))
         grids[i] = mover = replace(mover, distance=np.where(mover.weight > 0, mover.distance, guess))
         room = np.minimum(room, distance_to(base, mover, T_base_mover))
-    emptied = (base.weight == 0) & (room < 0)
-    base = replace(
-        base, distance=np.where(emptied, np.float32(1), base.distance), weight=np.where(emptied, 1, base.weight)
-    )
     base = _filled(base, surfaces[0], config)
     taken = (config.clearance * base.voxel - room) / base.truncation
     grids[0] = replace(base, distance=np.maximum(base.distance, np.minimum(taken, 1)))

@@ -25,6 +25,9 @@ COLOUR_SCALE = 0.2
 PROMISING = 0.6
 """A coarse score that is this fraction of the best is worth a finer look."""
 
+BASE = np.eye(4)
+"""Where the base takes what hangs on it."""
+
 HIDDEN_SCORE = 0.3
 """Score of unseen space, between a surface that fits (1) and free space (−1)."""
 
@@ -246,7 +249,7 @@ class Motion:
     """Radians or scene units."""
     score: float
     """Mean score of the seeds, at most 1."""
-    after: np.ndarray = field(default_factory=lambda: np.eye(4))
+    after: np.ndarray = field(default_factory=lambda: BASE)
     """(4, 4) where the motion of another part, on which this one hangs, takes it then."""
 
     @staticmethod
@@ -271,7 +274,7 @@ def inverted(motion: Motion) -> Motion:
 
 def carrier_of(motion: Motion, motions: Sequence[Motion]) -> int | None:
     """Index of the motion that carries this one on; None for one that hangs on the base."""
-    if np.array_equal(motion.after, np.eye(4)):
+    if np.array_equal(motion.after, BASE):
         return None
     return int(np.argmin([np.inf if m is motion else np.abs(m.T - motion.after).max() for m in motions]))
 
@@ -285,7 +288,7 @@ def scan(
     kinds: tuple[str, ...] = ("revolute", "prismatic"),
     values: np.ndarray | None = None,
     near: Motion | None = None,
-    after: np.ndarray | None = None,
+    after: np.ndarray = BASE,
     keep: int = 12,
 ) -> list[Motion]:
     """The best distinct motions of seeds (m, 3) with colours (m, 3), each about one of ``directions`` (d, 3).
@@ -298,16 +301,8 @@ def scan(
 
     Distinct: their mean displacement of the seeds differs by more than three voxels.
     """
-    if after is not None:  # Where it takes them first, the same joint stands elsewhere.
-        R = after[:3, :3]
-        if near is not None:
-            near = replace(near, pivot=moved(near.pivot[None], after)[0])
-        seeds = moved(seeds, after)
-        found = scan(seeds, colours, directions @ R.T, volume, kinds=kinds, values=values, near=near, keep=keep)
-        back = np.linalg.inv(after)
-        return [
-            replace(m, axis=m.axis @ R, pivot=moved(m.pivot[None], back)[0], after=np.asarray(after)) for m in found
-        ]
+    R, back = after[:3, :3], np.linalg.inv(after)
+    seeds, directions = moved(seeds, after), directions @ R.T  # There the same joint stands elsewhere.
     directions = np.ascontiguousarray(directions, dtype=np.float64)
     grid = (volume.origin.astype(np.float32), volume.voxel, volume.score, volume.colour)
     seeds32, colours32 = seeds.astype(np.float32), colours.astype(np.float32)
@@ -318,7 +313,10 @@ def scan(
     if "revolute" in kinds:
         angles = values if values is not None else both_signs(np.radians(np.arange(5, 151, 5)))
         angles = angles[np.abs(angles) > 1e-3]
-        box = (low, high) if near is None else (near.pivot - 4 * volume.voxel, near.pivot + 4 * volume.voxel)
+        box = (low, high)
+        if near is not None:
+            pivot = moved(near.pivot[None], after)[0]
+            box = (pivot - 4 * volume.voxel, pivot + 4 * volume.voxel)
         score = np.full((len(directions), len(angles)), -1, np.float32)
         pivots = np.zeros((*score.shape, 3))
         wanted = np.ones(score.shape, bool)
@@ -353,7 +351,7 @@ def scan(
             ends.append(end)
             if len(kept) == keep:
                 break
-    return kept
+    return [replace(m, axis=m.axis @ R, pivot=moved(m.pivot[None], back)[0], after=after) for m in kept]
 
 
 def both_signs(values: np.ndarray) -> np.ndarray:

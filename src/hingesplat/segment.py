@@ -13,18 +13,14 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from hingesplat.capture import View
-from hingesplat.chains import misfit
 from hingesplat.gaussians import Gaussians
-from hingesplat.hypotheses import HypothesesConfig, consensus, distinct, polished, propose, refit
+from hingesplat.hypotheses import HypothesesConfig, consensus, distinct, polished, propose, propose_hanging, refit
 from hingesplat.labelling import Labelling, seed_costs
 from hingesplat.pieces import reattach_fragments, split_pieces
-from hingesplat.search import Motion, ScoreVolume, carrier_of, inverted, novelty, scan, score_volume
+from hingesplat.search import BASE, Motion, ScoreVolume, carrier_of, inverted, novelty, scan, score_volume
 from hingesplat.stereo import DepthMap
 from hingesplat.surface import Surface, bounds, surface_of, thin
 from hingesplat.visibility import FREE, HIDDEN, ask
-
-HANGING = 0.02
-"""Mean error of the best joint on the base, as a fraction of the extent, from which a part may hang on another."""
 
 
 @dataclass(frozen=True)
@@ -165,18 +161,19 @@ def segment(
     # What no joint on the base explains may hang on another part.
     left = np.flatnonzero(costs_of(chosen).min(1) >= config.explained_cost) if chosen else np.zeros(0, int)
     stray = [judging[0][left[left < len(judging[0])]], judging[1][left[left >= len(judging[0])] - len(judging[0])]]
-    hanging: list[Motion] = []
-    if len(left) >= config.min_part_seeds:
-        for carrier in chosen:
-            hanging += propose(surfaces, fresh, stray, coarse, fine, extent, config.hypotheses, rng, carrier.T)
+    hanging = propose_hanging(
+        chosen,
+        lambda motions: costs_of(motions)[left],
+        surfaces,
+        fresh,
+        stray,
+        coarse,
+        fine,
+        extent,
+        config.hypotheses,
+        rng,
+    )
     if hanging:
-        agree = costs_of(hanging)[left] < config.hypotheses.consensus_cost
-        where = np.concatenate([surfaces[s].points[stray[s]] for s in (0, 1)])
-        hanging = [
-            m
-            for m, a in zip(hanging, agree.T, strict=True)
-            if a.sum() >= config.min_part_seeds and misfit(m.T[None], where[a]) > HANGING * extent
-        ]
         more = settled([*chosen, *hanging], config.hanging_cost)
         if any(carrier_of(motion, more) is not None for motion in more):
             chosen = more
@@ -218,12 +215,12 @@ def track(
     found: dict[int, np.ndarray] = {}
     for k in sorted(range(len(motions)), key=lambda k: k not in on_base):
         motion, carrier = motions[k], carrier_of(motions[k], motions)
-        after = None if carrier is None else found[carrier]
+        after = BASE if carrier is None else found[carrier]
         own = np.flatnonzero(own_label == k + 1)
         if len(own) < config.min_part_seeds:
-            found[k] = np.eye(4) if after is None else after
+            found[k] = after
             continue
-        motion = replace(motion, value=0.0, after=np.eye(4) if after is None else after)
+        motion = replace(motion, value=0.0, after=after)
         mine = here.rows(rng.choice(own, min(2 * config.hypotheses.seeds_per_search, len(own)), replace=False))
         reach = np.radians(150) if motion.kind == "revolute" else extent / 2
         trials = scan(

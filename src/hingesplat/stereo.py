@@ -182,7 +182,7 @@ def seen_through(points: np.ndarray, maps: Sequence[DepthMap], tolerance: float)
 def contradicted(points: np.ndarray, maps: Sequence[DepthMap], tolerance: float) -> np.ndarray:
     """(n,) bool: at least two maps see through points (n, 3), and more than put their surface there."""
     same, through = _votes(points, maps, tolerance / 2)
-    return (through >= 3) & (through > 2 * same)
+    return (through >= 2) & (through > same)
 
 
 def _votes(points: np.ndarray, maps: Sequence[DepthMap], tolerance: float) -> tuple[np.ndarray, np.ndarray]:
