@@ -12,12 +12,13 @@ from hingesplat.capture import View
 from hingesplat.gaussians import Gaussians, posed
 from hingesplat.identity import Free, Identity, IdentityConfig, identity_of, parts_of_shifts
 from hingesplat.losses.part import soft_motion
+from hingesplat.losses.photometric import photometric
 from hingesplat.optim import GaussianAdam, LearningRates
 from hingesplat.physics import PhysicsConfig, RepelConfig, Repulsion, Targets, one_hot, physics_loss
-from hingesplat.poses import PoseDelta, StateLossConfig, part_centres, state_loss
+from hingesplat.poses import PoseDelta, StateLossConfig, draw_state, part_centres, state_loss
 from hingesplat.slots import SlotsConfig, living_slots
 from hingesplat.stereo import DepthMap
-from hingesplat.training import Report, averaged, grow, shuffled, training_views
+from hingesplat.training import Report, TrainingView, averaged, grow, shuffled, training_views
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,10 @@ class ArticulateConfig:
     """Optimiser steps, each on one photograph of one state."""
     max_gaussians: int = 16_000
     """Cap on the number of canonical Gaussians."""
+    align_steps: int = 240
+    """Steps before these in which parts move and nothing else changes, from a start that was searched for."""
+    align_rate: float = 1e-2
+    """Adam step of their poses then (radians, extents); decays to 10 %."""
     pose_rate: float = 2e-3
     """Adam step of the part poses (radians, extents) at the start; decays to 2 %."""
     render: StateLossConfig = field(default_factory=StateLossConfig)
@@ -95,6 +100,8 @@ def articulate(
     extra = {"state_sh": (torch.zeros((len(canonical), len(views) - 1, 3)), config.rates.sh)}
     optimiser = GaussianAdam(canonical, config.rates, extent, extra | identity.extra | targets.extra)
     training = training_views(views, maps)
+    if first and config.identity.kind == "hard":
+        _align(canonical, poses, training, config, extent, rng)
     photographs = shuffled(training, rng)
     statistics = torch.zeros((len(optimiser), 3))
     tell = averaged(report, config.steps)
@@ -126,6 +133,32 @@ def articulate(
             targets.stale()
         tell(loss, error, len(optimiser))
     return _result(optimiser, poses, identity, extent, config, seed)
+
+
+def _align(
+    canonical: Gaussians,
+    poses: PoseDelta,
+    training: Sequence[Sequence[TrainingView]],
+    config: ArticulateConfig,
+    extent: float,
+    rng: np.random.Generator,
+) -> None:
+    """Move the parts alone, before anything is painted anew.
+
+    What the shape of a part leaves open (a round bar turned about itself) its texture tells, as long as Gaussians have
+    not taken on the colours of a wrong pose.
+    """
+    adam = torch.optim.Adam(poses.parameters, lr=config.align_rate)
+    photographs = shuffled(training[1:], rng)
+    for step in range(config.align_steps):
+        state, view = next(photographs)
+        R, t = poses.Rt()
+        r = draw_state(canonical, R[state + 1], t[state + 1], view.camera, background=torch.ones(3))
+        photometric(r.rgba, view.target, config.render.ssim_weight).backward()
+        for group in adam.param_groups:
+            group["lr"] = config.align_rate * 0.1 ** (step / config.align_steps)
+        adam.step()
+        adam.zero_grad(set_to_none=True)
 
 
 def _result(
