@@ -18,7 +18,7 @@ from scenes import (
     scene,
 )
 
-CONFIG = ArticulateConfig(steps=80, pose_rate=4e-3)
+CONFIG = ArticulateConfig(steps=80, pose_rate=4e-3, align_steps=0)
 FEW = replace(CONFIG, steps=16, densify_every=6)
 
 
@@ -58,6 +58,16 @@ def test_a_motion_a_little_off_comes_closer(kind) -> None:
     assert distance(found.T_state_0, made) < 0.35 * distance(off_by(made, 2.0), made)
     assert angle_between(found.T_state_0[1, 1], made.T_state_0[1, 1]) < 1.0
     assert losses[-1] < losses[0]
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+def test_parts_far_off_are_aligned_before_anything_is_painted_anew(kind) -> None:
+    made = scene(kind, 64, 0.06)
+    once = replace(CONFIG, steps=1, pose_rate=0.0)
+    start = distance(off_by(made, 8.0), made)
+    aligned, left = (run(made, replace(once, align_steps=n), degrees=8.0)[0] for n in (240, 0))
+    assert distance(aligned.T_state_0, made) < 0.2 * start
+    assert distance(left.T_state_0, made) == pytest.approx(start, rel=1e-3)
 
 
 def test_the_base_and_state_0_stay_and_poses_are_rigid() -> None:
