@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from safetensors.torch import load_file
 
 from hingesplat import cli, pipeline
@@ -126,6 +127,9 @@ def run(tmp_path: Path) -> Run:
     """A run that has come to its segmentation."""
     MADE.gaussians.save(tmp_path / "fit_state0.safetensors")
     MADE.at(1).save(tmp_path / "fit_state1.safetensors")
+    for t, state in enumerate(CAPTURE.states):  # Nothing is known of depth.
+        unknown = {str(i): torch.zeros(view.rgba.shape[:2]) for i, view in enumerate(state.train)}
+        pipeline.write_tensors(tmp_path / f"depth_state{t}.safetensors", unknown)
     return Run(tmp_path, CAPTURE, ReconstructConfig(), lambda **_: None)
 
 
