@@ -15,7 +15,7 @@ from hingesplat.losses.part import soft_motion
 from hingesplat.losses.photometric import photometric
 from hingesplat.optim import GaussianAdam, LearningRates
 from hingesplat.physics import PhysicsConfig, RepelConfig, Repulsion, Targets, one_hot, physics_loss
-from hingesplat.poses import PoseDelta, StateLossConfig, draw_state, part_centres, state_loss
+from hingesplat.poses import PoseDelta, StateLossConfig, draw_state, part_centres, pose_step, state_loss
 from hingesplat.slots import SlotsConfig, living_slots
 from hingesplat.stereo import DepthMap
 from hingesplat.training import Report, TrainingView, averaged, grow, shuffled, training_views
@@ -101,7 +101,7 @@ def articulate(
     optimiser = GaussianAdam(canonical, config.rates, extent, extra | identity.extra | targets.extra)
     training = training_views(views, maps)
     if first and config.identity.kind == "hard":
-        _align(canonical, poses, training, config, extent, rng)
+        _align(canonical, poses, training, config, rng)
     photographs = shuffled(training, rng)
     statistics = torch.zeros((len(optimiser), 3))
     tell = averaged(report, config.steps)
@@ -122,10 +122,7 @@ def articulate(
             loss = loss + physics_loss(g, p, R[state], t[state], aim, config.physics, extent, generator)
         loss.backward()
         optimiser.step(progress)
-        for group in pose_adam.param_groups:
-            group["lr"] = config.pose_rate * 0.02**progress
-        pose_adam.step()
-        pose_adam.zero_grad(set_to_none=True)
+        pose_step(pose_adam, config.pose_rate, progress)
         if step % config.densify_every == config.densify_every - 1 and progress < 0.7:
             grow(optimiser, statistics, config.max_gaussians, config.min_opacity, extent, generator)
             statistics = torch.zeros((len(optimiser), 3))
@@ -140,7 +137,6 @@ def _align(
     poses: PoseDelta,
     training: Sequence[Sequence[TrainingView]],
     config: ArticulateConfig,
-    extent: float,
     rng: np.random.Generator,
 ) -> None:
     """Move the parts alone, before anything is painted anew.
@@ -155,10 +151,7 @@ def _align(
         R, t = poses.Rt()
         r = draw_state(canonical, R[state + 1], t[state + 1], view.camera, background=torch.ones(3))
         photometric(r.rgba, view.target, config.render.ssim_weight).backward()
-        for group in adam.param_groups:
-            group["lr"] = config.align_rate * 0.1 ** (step / config.align_steps)
-        adam.step()
-        adam.zero_grad(set_to_none=True)
+        pose_step(adam, config.align_rate, step / config.align_steps, end=0.1)
 
 
 def _result(

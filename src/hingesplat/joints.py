@@ -15,7 +15,7 @@ from hingesplat.chains import closest_joint, parents_of
 from hingesplat.gaussians import Gaussians
 from hingesplat.losses.photometric import photometric
 from hingesplat.optim import GaussianAdam, LearningRates
-from hingesplat.poses import StateLossConfig, draw_state, part_centres, state_loss
+from hingesplat.poses import StateLossConfig, draw_state, part_centres, pose_step, state_loss
 from hingesplat.se3 import rotvec_to_matrix
 from hingesplat.stereo import DepthMap
 from hingesplat.training import Report, TrainingView, averaged, shuffled, training_views
@@ -182,7 +182,7 @@ def find_joints(
         loss, error = state_loss(optimiser, R[state], t[state], view, state, config.render, extent)
         loss.backward()
         optimiser.step(progress)
-        _joint_step(adam, config.rate, progress)
+        pose_step(adam, config.rate, progress)
         tell(loss, error, len(optimiser))
     finished = optimiser.gaussians.detached()
     offsets = optimiser.values["state_sh"].detach().permute(1, 0, 2)
@@ -192,13 +192,6 @@ def find_joints(
     pixel = float(np.median([_pixel(v.camera, finished) for state in training for v in state]))
     joints = _joints(kinds, poses, finished, confidence, deviation, seen, sum(len(s) for s in training), pixel)
     return JointResult(finished, all_sh, joints)
-
-
-def _joint_step(adam: torch.optim.Adam, rate: float, progress: float) -> None:
-    for group in adam.param_groups:
-        group["lr"] = rate * 0.02**progress
-    adam.step()
-    adam.zero_grad(set_to_none=True)
 
 
 def _picture_loss(
@@ -231,7 +224,7 @@ def _choose_types(
         for step in range(config.type_steps):
             state, view = next(photographs)
             _picture_loss(g, sh, poses, view, state + 1, config).backward()
-            _joint_step(adam, config.rate, step / config.type_steps)
+            pose_step(adam, config.rate, step / config.type_steps)
         losses[kind] = _losses_by_part(g, sh, training, poses, n_joints)
         if kind == "revolute":
             offset = (part_centres(g, n_joints + 1)[1:] - poses.pivot()).detach()

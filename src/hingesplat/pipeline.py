@@ -387,8 +387,9 @@ def _articulate(run: Run) -> None:
     else:
         config, report = run.config.articulate, run.reporting("articulate")
         seed = run.config.seed
-        maps = [_depth(run, t) for t in range(len(run.views))]
-        moved = articulate(canonical, T_state_0, run.views, config, fitted=fitted, maps=maps, seed=seed, report=report)
+        moved = articulate(
+            canonical, T_state_0, run.views, config, fitted=fitted, maps=_depths(run), seed=seed, report=report
+        )
     extra = {"T_state_0": torch.from_numpy(np.asarray(moved.T_state_0)), "state_sh": moved.state_sh}
     write_tensors(run / "articulation.safetensors", vars(moved.gaussians) | extra)
 
@@ -401,7 +402,7 @@ def _joints(run: Run) -> None:
     joints: tuple[Joint, ...] = ()
     if T_state_0.shape[1] > 1:
         config, report = run.config.joints, run.reporting("joints")
-        maps, seed = [_depth(run, t) for t in range(len(run.views))], run.config.seed
+        maps, seed = _depths(run), run.config.seed
         found = find_joints(gaussians, T_state_0, state_sh, run.views, config, maps=maps, seed=seed, report=report)
         gaussians, state_sh, joints = found.gaussians, found.state_sh, found.joints
     gaussians = gaussians.detached()
@@ -418,9 +419,8 @@ def _joints(run: Run) -> None:
 def _mesh(run: Run) -> None:
     gaussians, twin = load_result(run.folder)
     states = [([v.camera for v in views], twin.at_state(t)) for t, views in enumerate(run.views)]
-    maps = [_depth(run, t) for t in range(len(states))]
     path = [poses for t in range(1, len(states)) for poses in twin.on_the_way(t, run.config.mesh.steps)]
-    meshes = mesh_parts(gaussians, states, run.config.mesh, maps=maps, path=path)
+    meshes = mesh_parts(gaussians, states, run.config.mesh, maps=_depths(run), path=path)
     parts = []
     with whole_folder(run / "parts") as folder:
         for part in twin.parts:
@@ -494,6 +494,11 @@ def _fitted(run: Run, state: int) -> Gaussians:
 def _depth(run: Run, state: int) -> list[DepthMap]:
     known, views = load_file(run / f"depth_state{state}.safetensors"), run.views[state]
     return [depth_map(view, known[str(i)].numpy()) for i, view in enumerate(views)]
+
+
+def _depths(run: Run) -> list[list[DepthMap]]:
+    """Those of every state."""
+    return [_depth(run, t) for t in range(len(run.views))]
 
 
 def _check(config: ReconstructConfig) -> None:

@@ -68,6 +68,14 @@ def draw_state(
     return rasterize(*placed.drawn, camera, channels=channels, background=background, screen_gradient=screen_gradient)
 
 
+def pose_step(adam: torch.optim.Adam, rate: float, progress: float, end: float = 0.02) -> None:
+    """One step of poses or joints; their rate decays to ``end`` of ``rate`` as ``progress`` goes from 0 to 1."""
+    for group in adam.param_groups:
+        group["lr"] = rate * end**progress
+    adam.step()
+    adam.zero_grad(set_to_none=True)
+
+
 def part_centres(g: Gaussians, parts: int) -> Tensor:
     """(parts, 3) mean centre of each part's Gaussians; the origin for a part without any."""
     total = g.means.new_zeros((parts, 3)).index_add_(0, g.part, g.means)

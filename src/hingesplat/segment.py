@@ -211,10 +211,10 @@ def track(
     extent = float((high - low).max())
     volume = score_volume(there.points, there.colours, there.sight, here.sight, low, high, 2 * config.cells)
     own_label = labels[KDTree(gaussians[0].means.numpy()).query(here.points)[1]]
-    on_base = [k for k, motion in enumerate(motions) if carrier_of(motion, motions) is None]
+    carriers = [carrier_of(motion, motions) for motion in motions]
     found: dict[int, np.ndarray] = {}
-    for k in sorted(range(len(motions)), key=lambda k: k not in on_base):
-        motion, carrier = motions[k], carrier_of(motions[k], motions)
+    for k in sorted(range(len(motions)), key=lambda k: carriers[k] is not None):
+        motion, carrier = motions[k], carriers[k]
         after = BASE if carrier is None else found[carrier]
         own = np.flatnonzero(own_label == k + 1)
         if len(own) < config.min_part_seeds:
