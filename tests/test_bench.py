@@ -209,6 +209,15 @@ def test_medians_beside_other_methods_are_computed(options: BenchOptions) -> Non
     assert "Side by side (runs: 1), artgs's median is better in: axis ° (0.05 against 0.1)." in text
 
 
+def test_times_of_a_busy_machine_are_not_kept(runner: Runner, options: BenchOptions) -> None:
+    said: list[str] = []
+    page = bench(replace(options, busy=True), ("hingesplat",), None, said.append)
+    assert all(row["summary"]["seconds"] == {} for row in load_rows(options.out))
+    head, _, line = [row for row in page.read_text().splitlines() if row.startswith("|")][:3]
+    assert dict(zip(head.split(" | "), line.split(" | "), strict=True))["minutes"] == "–"
+    assert said[-1].endswith(" min")  # Whoever waits is told.
+
+
 def write_json_in(options: BenchOptions, case: Case, found: dict[str, Any]) -> None:
     (options.out / "runs").mkdir(parents=True, exist_ok=True)
     write_json(options.out / "runs" / f"{case.name}.json", case.key | found)

@@ -52,6 +52,8 @@ class BenchOptions:
     """Where made captures and run folders go and stay; else they go when they have been measured."""
     retry: bool = False
     """Run again what failed before."""
+    busy: bool = False
+    """The machine has other work meanwhile: how long runs take is not taken down."""
     recorded: bool = False
     """Run nothing: make the page anew."""
 
@@ -175,9 +177,11 @@ def run_all(cases: Sequence[Case], options: BenchOptions, homes: dict[str, Path]
             mine = [c for c in missing if (c.subject, c.seed, c.views, c.size) == (subject, seed, views, size)]
             for case in mine:
                 row = measure(case, homes.get(subject), home, options.out)
-                write_json(options.out / "runs" / f"{case.name}.json", row)
                 done += 1
                 how = row.get("error") or f"{row['summary']['seconds']['total'] / 60:.1f} min"
+                if options.busy and "summary" in row:
+                    row["summary"]["seconds"] = {}
+                write_json(options.out / "runs" / f"{case.name}.json", row)
                 what = f"{case.subject} {case.method} seed {case.seed} {_plain(case.options)}"
                 say(f"{done}/{len(missing)} {what}: {how}")
             if options.work is None:

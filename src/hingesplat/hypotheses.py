@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -40,6 +41,25 @@ class HypothesesConfig:
     """A motion is refined on no fewer points."""
 
 
+@dataclass(frozen=True)
+class Evidence:
+    """What every search for motions between two states goes by; pairs are (state 0, the other)."""
+
+    surfaces: tuple[Surface, Surface]
+    fresh: tuple[Surface, Surface]
+    """The points of each state that the other does not show in the same place: there something may have come to lie."""
+    coarse: tuple[ScoreVolume, ScoreVolume]
+    fine: tuple[ScoreVolume, ScoreVolume]
+    extent: float
+    config: HypothesesConfig
+    rng: np.random.Generator
+
+    @cached_property
+    def blurred(self) -> tuple[np.ndarray, np.ndarray]:
+        """Colours (n, 3) of the surfaces as coarse as the volumes."""
+        return self.surfaces[0].blurred(), self.surfaces[1].blurred()
+
+
 def groups_to_try(points: np.ndarray, extent: float, seed: int) -> list[np.ndarray]:
     """Connected pieces of the seeds, and patches of the pieces that are large enough to be several parts at once."""
     label = components(points, 0.035 * extent)
@@ -68,102 +88,76 @@ def axis_directions(groups: Sequence[np.ndarray]) -> np.ndarray:
     return np.array(kept[:12])
 
 
-def propose(
-    surfaces: tuple[Surface, Surface],
-    fresh: Sequence[Surface],
-    seeds: Sequence[np.ndarray],
-    coarse: Sequence[ScoreVolume],
-    fine: Sequence[ScoreVolume],
-    extent: float,
-    config: HypothesesConfig,
-    rng: np.random.Generator,
-    after: np.ndarray = BASE,
-) -> list[Motion]:
-    """Hypotheses, as motions from state 0 to 1, from every group of seeds of both states.
+def propose(evidence: Evidence, seeds: Sequence[np.ndarray], after: np.ndarray = BASE) -> list[Motion]:
+    """Hypotheses, as motions from state 0 to 1, from every group of seeds (rows of both states' surfaces).
 
-    ``fresh`` are the points of each state that the other does not show in the same place; ``after`` (4, 4) is the
-    motion of another part, on which these seeds hang.
+    ``after`` (4, 4) is the motion of another part, on which these seeds hang.
     """
+    e, surfaces = evidence, evidence.surfaces
     groups = []
     for s in (0, 1):
         p = surfaces[s].points[seeds[s]]
-        groups += [(s, seeds[s][g]) for g in groups_to_try(p, extent, seed=int(rng.integers(2**31)))]
+        groups += [(s, seeds[s][g]) for g in groups_to_try(p, e.extent, seed=int(e.rng.integers(2**31)))]
     if not groups:
         return []
     directions = axis_directions([surfaces[s].points[g] for s, g in groups])
     pool = []
-    blurred = [surface.blurred() for surface in surfaces]
     for s, group in groups:
-        chosen = rng.choice(group, min(config.seeds_per_search, len(group)), replace=False)
+        chosen = e.rng.choice(group, min(e.config.seeds_per_search, len(group)), replace=False)
         p, c = surfaces[s].points[chosen], surfaces[s].colours[chosen]
         # Slides get a hearing of their own: with three numbers fewer they are seldom the luckiest fit.
         for kind in ("revolute", "prismatic"):
             then = after if s == 0 else np.linalg.inv(after)
-            found = scan(p, blurred[s][chosen], directions, coarse[1 - s], kinds=(kind,), after=then, keep=4)
+            found = scan(p, e.blurred[s][chosen], directions, e.coarse[1 - s], kinds=(kind,), after=then, keep=4)
             for motion in found:
                 if motion.score > max(0.1, 0.7 * found[0].score):
                     # Compare hypotheses at their best: on the grid a true one may be 3° off and lose to a lucky one.
                     for spread in (4.0, 1.5):
-                        motion = refine_motion(motion, p, c, fine[1 - s], spread)
-                    motion = polished([motion], surfaces[s].rows(chosen), fresh[1 - s], extent)
+                        motion = refine_motion(motion, p, c, e.fine[1 - s], spread)
+                    motion = polished([motion], surfaces[s].rows(chosen), e.fresh[1 - s], e.extent)
                     pool.append(motion if s == 0 else inverted(motion))
     return pool
 
 
 def propose_hanging(
+    evidence: Evidence,
+    seeds: Sequence[np.ndarray],
     carriers: Sequence[Motion],
     costs_of: Callable[[Sequence[Motion]], np.ndarray],
-    surfaces: tuple[Surface, Surface],
-    fresh: Sequence[Surface],
-    seeds: Sequence[np.ndarray],
-    coarse: Sequence[ScoreVolume],
-    fine: Sequence[ScoreVolume],
-    extent: float,
-    config: HypothesesConfig,
-    rng: np.random.Generator,
 ) -> list[Motion]:
     """Hypotheses for seeds that no joint on the base explains: joints on the parts that the carriers move.
 
     Only motions that no joint on the base comes near; ``costs_of`` gives the (seeds, motions) costs of these seeds.
     """
+    config, least = evidence.config, HANGING * evidence.extent
     if sum(map(len, seeds)) < config.min_points:
         return []
-    pool: list[Motion] = []
-    for carrier in carriers:
-        pool += propose(surfaces, fresh, seeds, coarse, fine, extent, config, rng, carrier.T)
+    pool = [motion for carrier in carriers for motion in propose(evidence, seeds, carrier.T)]
     if not pool:
         return []
-    points = np.concatenate([surfaces[s].points[seeds[s]] for s in (0, 1)])
-    agree = (costs_of(pool) < config.consensus_cost).T
-    enough = [bool(a.sum() >= config.min_points) for a in agree]
+    points = np.concatenate([evidence.surfaces[s].points[seeds[s]] for s in (0, 1)])
+    agreeing = [points[agree] for agree in (costs_of(pool) < config.consensus_cost).T]
     return [
-        m
-        for m, a, many in zip(pool, agree, enough, strict=True)
-        if many and misfit(m.T[None], points[a]) > HANGING * extent
+        motion
+        for motion, own in zip(pool, agreeing, strict=True)
+        if len(own) >= config.min_points and misfit(motion.T[None], own) > least
     ]
 
 
 def consensus(
-    pool: Sequence[Motion],
-    costs: np.ndarray,
-    surfaces: tuple[Surface, Surface],
-    fresh: Sequence[Surface],
-    seeds: Sequence[np.ndarray],
-    fine: Sequence[ScoreVolume],
-    extent: float,
-    config: HypothesesConfig,
-    rng: np.random.Generator,
+    evidence: Evidence, seeds: Sequence[np.ndarray], pool: Sequence[Motion], costs: np.ndarray
 ) -> list[Motion]:
     """The most promising hypotheses, each refined on all seeds that agree with it wherever they are.
 
     A hypothesis comes from one patch; the right one fits the whole part, and grows better with it.
     """
-    sample = np.concatenate([surfaces[s].points[seeds[s][:100]] for s in (0, 1)])
+    config = evidence.config
+    sample = np.concatenate([evidence.surfaces[s].points[seeds[s][:100]] for s in (0, 1)])
     refined = []
-    for k in distinct(pool, costs, sample, 0.02 * extent, config.consensus_motions):
+    for k in distinct(pool, costs, sample, 0.02 * evidence.extent, config.consensus_motions):
         agree = costs[:, k] < config.consensus_cost
         own = (seeds[0][agree[: len(seeds[0])]], seeds[1][agree[len(seeds[0]) :]])
-        refined.append(refit(pool[k], own, surfaces, fresh, fine, extent, config, rng))
+        refined.append(refit(evidence, pool[k], own))
     return refined
 
 
@@ -207,17 +201,9 @@ def refine_motion(
     return best if best.score > straight.score + 0.02 else straight
 
 
-def refit(
-    motion: Motion,
-    own: tuple[np.ndarray, np.ndarray],
-    surfaces: tuple[Surface, Surface],
-    fresh: Sequence[Surface],
-    fine: Sequence[ScoreVolume],
-    extent: float,
-    config: HypothesesConfig,
-    rng: np.random.Generator,
-) -> Motion:
-    """Refine on the points that the motion owns, from the state that has more of them to those of the other."""
+def refit(evidence: Evidence, motion: Motion, own: tuple[np.ndarray, np.ndarray]) -> Motion:
+    """Refine on the points that the motion owns (rows), from the state that has more of them to those of the other."""
+    surfaces, extent, config, rng = evidence.surfaces, evidence.extent, evidence.config, evidence.rng
     s = int(len(own[1]) > len(own[0]))
     if len(own[s]) < config.min_points:
         return motion
@@ -226,8 +212,8 @@ def refit(
     start = motion if s == 0 else inverted(motion)
     if len(theirs.points) < config.min_points:
         few = mine.rows(np.arange(min(2 * config.seeds_per_search, len(mine.points))))
-        near = refine_motion(start, few.points, few.colours, fine[1 - s], 3.0)
-        fit = polished([start, near], mine, fresh[1 - s], extent)
+        near = refine_motion(start, few.points, few.colours, evidence.fine[1 - s], 3.0)
+        fit = polished([start, near], mine, evidence.fresh[1 - s], extent)
         return fit if s == 0 else inverted(fit)
     # Against the whole of the other state a drawer would cling to the frame that it slides along.
     target = surfaces[1 - s].rows(own[1 - s]).cloud

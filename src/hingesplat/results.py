@@ -137,6 +137,12 @@ def joint_values(row: Row, key: str) -> list[float]:
     return [j[key] for j in row["metrics"]["joints"] if j[key] is not None]
 
 
+def seconds_of(row: Row, *stages: str) -> list[float]:
+    """One number, those of some stages of a run together; none where the machine had other work meanwhile."""
+    seconds = row["summary"]["seconds"]
+    return [sum(seconds.get(stage, 0.0) for stage in stages)] if seconds else []
+
+
 def number_of(row: Row, metric: str) -> float | None:
     """One of ``TITLES`` for a run; means over its joints or movable parts.
 
@@ -157,7 +163,7 @@ def number_of(row: Row, metric: str) -> float | None:
         case "penetration":
             values = [m["penetration"]["volume_fraction"]]
         case "minutes":
-            values = [row["summary"]["seconds"]["total"] / 60]
+            values = [s / 60 for s in seconds_of(row, "total")]
         case _:
             values = [m["views"][metric]]
     there = [v for v in values if v is not None]
@@ -205,7 +211,7 @@ def cells(rows: Sequence[Row]) -> dict[str, str]:
         return [max(joint_values(row, key), default=None) for row in good]
 
     def seconds(*stages: str) -> list[float]:
-        return [sum(r["summary"]["seconds"].get(s, 0.0) for s in stages) for r in good]
+        return [s for r in good for s in seconds_of(r, *stages)]
 
     joints = [j for r in good for j in r["metrics"]["joints"]]
     right = sum(j["type_true"] == j["type_found"] for j in joints)
@@ -317,7 +323,8 @@ def write_page(page: Path, rows: Sequence[Row], out: Path) -> Path:
         "has ended, and the last iterate counts. *Given* is what a method was told: `parts` is the true number of",
         "parts; joint types are told to none. A joint that was not found counts 90°. Chamfer distances as in the",
         "literature (squared, both directions, × 1000), penetration as a fraction of a part's volume. Times are one",
-        "run's alone; first stages taken over from another run count as they were measured there.",
+        "run's alone; first stages taken over from another run count as they were measured there. A dash stands where",
+        "the machine had other work, too.",
         "",
         *_machines(rows),
     ]

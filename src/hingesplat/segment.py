@@ -14,7 +14,16 @@ from scipy.spatial import KDTree
 
 from hingesplat.capture import View
 from hingesplat.gaussians import Gaussians
-from hingesplat.hypotheses import HypothesesConfig, consensus, distinct, polished, propose, propose_hanging, refit
+from hingesplat.hypotheses import (
+    Evidence,
+    HypothesesConfig,
+    consensus,
+    distinct,
+    polished,
+    propose,
+    propose_hanging,
+    refit,
+)
 from hingesplat.labelling import Labelling, seed_costs
 from hingesplat.pieces import reattach_fragments, split_pieces
 from hingesplat.search import BASE, Motion, ScoreVolume, carrier_of, inverted, novelty, scan, score_volume
@@ -88,6 +97,38 @@ def floating(answer: np.ndarray) -> np.ndarray:
     return (answer[:, FREE] >= 3) & (answer[:, FREE] > 0.15 * answer[:, : HIDDEN + 1].sum(1))
 
 
+def gather(
+    surfaces: tuple[Surface, Surface],
+    low: np.ndarray,
+    high: np.ndarray,
+    config: SegmentConfig,
+    rng: np.random.Generator,
+) -> tuple[Evidence, list[np.ndarray]]:
+    """What the search for motions goes by, and its seeds: rows of each state's points that must have moved.
+
+    ``low`` and ``high`` (3,) are the corners of both states together.
+    """
+    extent = float((high - low).max())
+    sights = [surface.sight for surface in surfaces]
+    answers = [ask(surfaces[s].points, surfaces[s].colours, sights[1 - s]) for s in (0, 1)]
+    seeds = []
+    for surface, answer in zip(surfaces, answers, strict=True):
+        index = np.flatnonzero(floating(answer))
+        seeds.append(index[thin(surface.points[index], 0.012 * extent, rng)])
+    # Where both states show a surface, nothing that moved has come to lie.
+    fresh = [s.rows(np.flatnonzero(novelty(a) > 0.5)) for s, a in zip(surfaces, answers, strict=True)]
+
+    def volumes(cells: int) -> tuple[ScoreVolume, ScoreVolume]:
+        first, last = (
+            score_volume(surfaces[s].points, surfaces[s].colours, sights[s], sights[1 - s], low, high, cells)
+            for s in (0, 1)
+        )
+        return first, last
+
+    coarse, fine = volumes(config.cells), volumes(2 * config.cells)
+    return Evidence(surfaces, (fresh[0], fresh[1]), coarse, fine, extent, config.hypotheses, rng), seeds
+
+
 def segment(
     gaussians: tuple[Gaussians, Gaussians],
     views: tuple[Sequence[View], Sequence[View]],
@@ -108,20 +149,8 @@ def segment(
     rng = np.random.default_rng(seed)
     low, high, surfaces = survey(gaussians, views, maps, config)
     extent = float((high - low).max())
-    sights = [surface.sight for surface in surfaces]
-    answers = [ask(surfaces[s].points, surfaces[s].colours, sights[1 - s]) for s in (0, 1)]
-    seeds = []
-    for surface, answer in zip(surfaces, answers, strict=True):
-        index = np.flatnonzero(floating(answer))
-        seeds.append(index[thin(surface.points[index], 0.012 * extent, rng)])
-    # Where both states show a surface, nothing that moved has come to lie.
-    fresh = [s.rows(np.flatnonzero(novelty(a) > 0.5)) for s, a in zip(surfaces, answers, strict=True)]
-
-    def volume(s: int, cells: int) -> ScoreVolume:
-        return score_volume(surfaces[s].points, surfaces[s].colours, sights[s], sights[1 - s], low, high, cells)
-
-    coarse, fine = [volume(s, config.cells) for s in (0, 1)], [volume(s, 2 * config.cells) for s in (0, 1)]
-    pool = propose(surfaces, fresh, seeds, coarse, fine, extent, config.hypotheses, rng)
+    evidence, seeds = gather(surfaces, low, high, config, rng)
+    pool = propose(evidence, seeds)
     n_seeds = sum(len(i) for i in seeds)
     if not pool:
         empty = (np.zeros(len(gaussians[0]), int), np.zeros(len(gaussians[1]), int))
@@ -134,11 +163,14 @@ def segment(
         """(seeds, candidates) what the other state's cameras say of every seed under every candidate."""
         forward, backward = [m.T for m in candidates], [inverted(m).T for m in candidates]
         return np.concatenate(
-            [seed_costs(judges[0], sights[1], forward, extent), seed_costs(judges[1], sights[0], backward, extent)]
+            [
+                seed_costs(judges[0], surfaces[1].sight, forward, extent),
+                seed_costs(judges[1], surfaces[0].sight, backward, extent),
+            ]
         )
 
     costs = costs_of(pool)
-    pool += consensus(pool, costs, surfaces, fresh, judging, fine, extent, config.hypotheses, rng)
+    pool += consensus(evidence, judging, pool, costs)
     costs = np.concatenate([costs, costs_of(pool[costs.shape[1] :])], 1)
     sample = np.concatenate([j.points[:100] for j in judges])
     chosen = [pool[k] for k in distinct(pool, costs, sample, 0.012 * extent, config.hypotheses.candidates)]
@@ -151,28 +183,14 @@ def segment(
         for _ in range(config.rounds):
             kept, owned = problem.choose([m.T for m in candidates], price, parts)
             owners = [(rows[0][owned[0] == i + 1], rows[1][owned[1] == i + 1]) for i in range(len(kept))]
-            candidates = [
-                refit(candidates[k], own, surfaces, fresh, fine, extent, config.hypotheses, rng)
-                for k, own in zip(kept, owners, strict=True)
-            ]
+            candidates = [refit(evidence, candidates[k], own) for k, own in zip(kept, owners, strict=True)]
         return candidates
 
     chosen = settled(chosen, config.part_cost)
     # What no joint on the base explains may hang on another part.
     left = np.flatnonzero(costs_of(chosen).min(1) >= config.explained_cost) if chosen else np.zeros(0, int)
     stray = [judging[0][left[left < len(judging[0])]], judging[1][left[left >= len(judging[0])] - len(judging[0])]]
-    hanging = propose_hanging(
-        chosen,
-        lambda motions: costs_of(motions)[left],
-        surfaces,
-        fresh,
-        stray,
-        coarse,
-        fine,
-        extent,
-        config.hypotheses,
-        rng,
-    )
+    hanging = propose_hanging(evidence, stray, chosen, lambda motions: costs_of(motions)[left])
     if hanging:
         more = settled([*chosen, *hanging], config.hanging_cost)
         if any(carrier_of(motion, more) is not None for motion in more):
