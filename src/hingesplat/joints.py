@@ -18,6 +18,7 @@ from hingesplat.optim import GaussianAdam, LearningRates
 from hingesplat.poses import StateLossConfig, draw_state, part_centres, pose_step, state_loss
 from hingesplat.se3 import rotvec_to_matrix
 from hingesplat.stereo import DepthMap
+from hingesplat.symmetry import round_about
 from hingesplat.training import Report, TrainingView, averaged, shuffled, training_views
 from hingesplat.twin import Joint, JointStd, JointType
 
@@ -331,6 +332,15 @@ def _views_that_show(
     return count
 
 
+def _ambiguity(kind: JointType, points: np.ndarray, axis: np.ndarray, pivot: np.ndarray) -> str:
+    """What the shape of a part leaves open, in words."""
+    if not round_about(points, axis, pivot):
+        return ""
+    if kind == "revolute":
+        return "; ambiguous: round about its axis, so that only its texture tells how far it turned"
+    return "; ambiguous: round about its axis, so that only its texture would tell if it turned as well"
+
+
 def _pixel(camera: Camera, gaussians: Gaussians) -> float:
     """The size of a pixel at the object's centre, scene units."""
     return float(np.linalg.norm(camera.centre - gaussians.means.mean(0).double().numpy())) / camera.fx
@@ -357,9 +367,9 @@ def _joints(
             axis, states = -axis, -states
         pivot = pivots[j] + axis * ((centroids[j] - pivots[j]) @ axis) if kind == "revolute" else centroids[j]
         std, words = JointStd(), ""
+        points = g.means[g.part == j + 1].double().numpy()
         if deviation is not None:
             d = deviation[j]
-            points = g.means[g.part == j + 1].double().numpy()
             spread = math.sqrt(points.var(0).sum()) if len(points) else poses.extent
             across = np.linalg.norm(np.cross(points - pivot, axis), axis=1) if len(points) else np.full(1, spread)
             axis_deg = math.degrees(math.hypot(d[0], d[1], ALONG * pixel / spread))
@@ -381,7 +391,7 @@ def _joints(
                 limits=(float(states.min()), float(states.max())),
                 std=std,
                 confidence=float(confidence[j]),
-                verdict=f"{words}seen in {seen[j]} of {n_views} views",
+                verdict=f"{words}seen in {seen[j]} of {n_views} views" + _ambiguity(kind, points, axis, pivot),
             )
         )
     return tuple(joints)
