@@ -352,10 +352,9 @@ def test_seen_costs_less_than_hidden_and_hidden_less_than_in_the_air() -> None:
 
 def test_to_stay_costs_the_static_nothing() -> None:
     mine = plain(patch((0, 0, 0), 5), wall(3))
-    costs = label_costs(mine, mine.sight, [np.eye(4), up(0.02), up(0.3)], extent=1)
-    assert (costs[:, :2] == 0).all()
-    # To move is a claim, but hardly one where photographs could not tell: beside a hinge, neighbours decide.
-    assert (costs[:, 2] > 0).all() and (costs[:, 3] > 2 * costs[:, 2]).all()
+    costs = label_costs(mine, mine.sight, [np.eye(4), up(0.3)], extent=1)
+    assert (costs[:, 0] == 0).all()
+    assert (costs[:, 1:] > 0).all()  # To move is a claim, even to nowhere.
 
 
 def test_what_floats_at_home_may_float_there() -> None:

@@ -18,8 +18,6 @@ from hingesplat.visibility import COLOUR, SURFACE, Sight, ask
 
 ARRIVED = 4
 """Views that must see a surface where a motion takes a point, for the point to have been seen there."""
-PLAIN_WAY = 0.1
-"""Extents that a point must move for anyone to tell for sure that it does."""
 HIDDEN_SEED_COST = 0.4
 """Cost of a seed that a motion takes out of everybody's sight."""
 NOBODY = 0.3
@@ -53,10 +51,9 @@ def label_costs(
         # Every surface is hidden from most sides: a few views that see it there are enough.
         arrived = np.clip(answer[:, SURFACE] / ARRIVED, 0, 1)
         colour = np.clip((answer[:, COLOUR] - 0.05) / 0.5, 0, 1)
-        # To move is a claim: it costs a little, and to be recognised far away costs more. Beside a hinge it is none:
-        # there photographs cannot tell, and neighbours must.
+        # To move is a claim: it costs a little, and to be recognised far away costs more.
         way = np.linalg.norm(points - surface.points, axis=1) / extent
-        claim = 0.05 * np.minimum(way / PLAIN_WAY, 1) + far_cost * way * arrived
+        claim = 0.0 if T is None else 0.05 + far_cost * way * arrived
         unseen = covered_cost if T is None else hidden_cost
         columns.append(contradiction + arrived * 0.5 * colour + (1 - arrived) * unseen + claim)
     return np.stack(columns, 1)
