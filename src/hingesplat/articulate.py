@@ -12,10 +12,9 @@ from hingesplat.capture import View
 from hingesplat.gaussians import Gaussians, posed
 from hingesplat.identity import Free, Identity, IdentityConfig, identity_of, parts_of_shifts
 from hingesplat.losses.part import soft_motion
-from hingesplat.losses.photometric import photometric
 from hingesplat.optim import GaussianAdam, LearningRates
 from hingesplat.physics import PhysicsConfig, RepelConfig, Repulsion, Targets, one_hot, physics_loss
-from hingesplat.poses import PoseDelta, StateLossConfig, draw_state, part_centres, pose_step, state_loss
+from hingesplat.poses import PoseDelta, StateLossConfig, part_centres, pose_loss, pose_step, state_loss
 from hingesplat.slots import SlotsConfig, living_slots
 from hingesplat.stereo import DepthMap
 from hingesplat.training import Report, TrainingView, averaged, grow, shuffled, training_views
@@ -149,8 +148,7 @@ def _align(
     for step in range(config.align_steps):
         state, view = next(photographs)
         R, t = poses.Rt()
-        r = draw_state(canonical, R[state + 1], t[state + 1], view.camera, background=torch.ones(3))
-        photometric(r.rgba, view.target, config.render.ssim_weight).backward()
+        pose_loss(canonical, R[state + 1], t[state + 1], view, config.render.ssim_weight).backward()
         pose_step(adam, config.align_rate, step / config.align_steps, end=0.1)
 
 

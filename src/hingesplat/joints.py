@@ -13,9 +13,8 @@ from hingesplat.camera import Camera
 from hingesplat.capture import View
 from hingesplat.chains import closest_joint, parents_of
 from hingesplat.gaussians import Gaussians
-from hingesplat.losses.photometric import photometric
 from hingesplat.optim import GaussianAdam, LearningRates
-from hingesplat.poses import StateLossConfig, draw_state, part_centres, pose_step, state_loss
+from hingesplat.poses import StateLossConfig, draw_state, part_centres, pose_loss, pose_step, state_loss
 from hingesplat.se3 import rotvec_to_matrix
 from hingesplat.stereo import DepthMap
 from hingesplat.symmetry import round_about
@@ -195,14 +194,6 @@ def find_joints(
     return JointResult(finished, all_sh, joints)
 
 
-def _picture_loss(
-    g: Gaussians, sh: Tensor, poses: JointPoses, view: TrainingView, state: int, config: JointsConfig
-) -> Tensor:
-    R, t = poses.Rt()
-    r = draw_state(g, R[state], t[state], view.camera, sh_offset=sh[state], background=torch.ones(3))
-    return photometric(r.rgba, view.target, config.render.ssim_weight)
-
-
 def _choose_types(
     g: Gaussians,
     sh: Tensor,
@@ -224,7 +215,8 @@ def _choose_types(
         photographs = shuffled(training[1:], rng)
         for step in range(config.type_steps):
             state, view = next(photographs)
-            _picture_loss(g, sh, poses, view, state + 1, config).backward()
+            R, t = poses.Rt()
+            pose_loss(g, R[state + 1], t[state + 1], view, config.render.ssim_weight, sh[state + 1]).backward()
             pose_step(adam, config.rate, step / config.type_steps)
         losses[kind] = _losses_by_part(g, sh, training, poses, n_joints)
         if kind == "revolute":
@@ -288,7 +280,9 @@ def _standard_deviations(
     def gradients() -> np.ndarray:
         rows = []
         for s, i in chosen:
-            (grad,) = torch.autograd.grad(_picture_loss(g, sh, poses, training[s][i], s, config), poses.theta)
+            R, t = poses.Rt()
+            loss = pose_loss(g, R[s], t[s], training[s][i], config.render.ssim_weight, sh[s])
+            (grad,) = torch.autograd.grad(loss, poses.theta)
             rows.append(grad.double().numpy())
         return np.stack(rows)
 

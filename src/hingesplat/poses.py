@@ -7,6 +7,7 @@ from torch import Tensor
 
 from hingesplat.camera import Camera
 from hingesplat.gaussians import Gaussians
+from hingesplat.losses.photometric import photometric
 from hingesplat.optim import GaussianAdam
 from hingesplat.render import Rendering, place, rasterize
 from hingesplat.se3 import rotvec_to_matrix
@@ -66,6 +67,14 @@ def draw_state(
     """
     placed = place(g, camera, pose=(R, t), means=means, sh_offset=sh_offset)
     return rasterize(*placed.drawn, camera, channels=channels, background=background, screen_gradient=screen_gradient)
+
+
+def pose_loss(
+    g: Gaussians, R: Tensor, t: Tensor, view: TrainingView, ssim_weight: float, sh_offset: Tensor | None = None
+) -> Tensor:
+    """What one photograph says of its state's part poses alone: L_render of Gaussians that are what they are."""
+    r = draw_state(g, R, t, view.camera, sh_offset=sh_offset, background=torch.ones(3))
+    return photometric(r.rgba, view.target, ssim_weight)
 
 
 def pose_step(adam: torch.optim.Adam, rate: float, progress: float, end: float = 0.02) -> None:
