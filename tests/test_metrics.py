@@ -1,6 +1,7 @@
 """Metrics: made cases whose figures are known exactly."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
 
 from hingesplat.capture import load_capture
 from hingesplat.errors import HingesplatError
@@ -250,6 +252,26 @@ def test_a_missing_part_and_a_superfluous_one(capture: Path, tmp_path: Path) -> 
     assert drawer["part"] == 2 and drawer["axis_deg"] == pytest.approx(0, abs=1e-6)
     assert metrics["superfluous_parts"] == 1
     assert metrics["cd"]["movable"][0] > 10 > metrics["cd"]["movable"][1]
+
+
+def test_masks_that_the_run_was_given_are_given_again(capture: Path, tmp_path: Path) -> None:
+    truth = load_truth(capture)
+    run = write_run(tmp_path / "run", truth, perfect_twin(truth))
+    surface_gaussians(truth, 500).save(run / "gaussians.safetensors")
+    plain, masks = tmp_path / "plain", tmp_path / "masks"
+    shutil.copytree(capture, plain)
+    for path in sorted(plain.glob("state_*/train/*.png")) + sorted(plain.glob("state_*/test/*.png")):
+        image, mask = Image.open(path), masks / path.relative_to(plain)
+        mask.parent.mkdir(parents=True, exist_ok=True)
+        image.getchannel("A").save(mask)
+        image.convert("RGB").save(path)
+    scores = []
+    for folder, given in ((capture, None), (plain, None), (plain, masks)):
+        (run / "config.json").write_text(json.dumps({"capture": str(folder)}))
+        scores.append(evaluate(run, capture, masks=given)["views"])
+    with_alpha, without, with_masks = scores
+    assert without["psnr"] is None and "--masks" in without["why_null"]
+    assert with_masks["psnr"] == pytest.approx(with_alpha["psnr"])
 
 
 def test_files_of_a_state_win_over_the_canonical_ones(capture: Path, tmp_path: Path) -> None:

@@ -184,6 +184,8 @@ class Evaluate:
     """A run folder."""
     truth: Path
     """Folder of the truth, or the capture that holds it."""
+    masks: Path | None = None
+    """The folder of masks that the run was given, if any."""
     quiet: bool = False
     """Say nothing but warnings and errors."""
 
@@ -192,7 +194,7 @@ class Evaluate:
         from hingesplat.metrics import evaluate
         from hingesplat.report import write_report
 
-        show_metrics(console, evaluate(self.run_folder, self.truth, simulation(self.run_folder / "export")))
+        show_metrics(console, evaluate(self.run_folder, self.truth, simulation(self.run_folder / "export"), self.masks))
         write_report(self.run_folder)
         console.print(f"written: {escape(str(self.run_folder / 'metrics.json'))}", soft_wrap=True)
 

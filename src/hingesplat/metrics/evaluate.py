@@ -35,13 +35,16 @@ class FoundPart:
     """Cleaned, world frame, one a state."""
 
 
-def evaluate(run: Path, truth: Path, simulation: Mapping[str, Any] = NO_SIMULATION) -> dict[str, Any]:
+def evaluate(
+    run: Path, truth: Path, simulation: Mapping[str, Any] = NO_SIMULATION, masks: Path | None = None
+) -> dict[str, Any]:
     """Compare the twin in the folder ``run`` with the truth and write ``run/metrics.json``.
 
     Parts are counted with the base. Chamfer distances are squared, the sum of both directions, ×1000, of
     10 000 points a surface: means over both states and three draws of points. Where the photographs or the
     Gaussians are not there, ``views`` holds nulls and ``why_null``. ``simulation`` is what
-    ``hingesplat.export.check.simulation`` gives and goes to the file as it is.
+    ``hingesplat.export.check.simulation`` gives and goes to the file as it is; ``masks`` are those that the run was
+    given, if any.
 
     Returns:
         What it wrote.
@@ -59,7 +62,7 @@ def evaluate(run: Path, truth: Path, simulation: Mapping[str, Any] = NO_SIMULATI
     true_of_found = match_parts(known, found)
     found_of_true = {true: part for part, true in true_of_found.items()}
 
-    views, part_iou = _score_views(run, twin, known, true_of_found)
+    views, part_iou = _score_views(run, twin, known, true_of_found, masks)
     metrics = {
         "parts_true": len(known.parts),
         "parts_found": len(twin.parts),
@@ -191,11 +194,13 @@ def _penetrations(twin: Twin, found: Sequence[FoundPart]) -> dict[str, Any]:
     return worst | {"each": {str(part): e for part, e in each.items()}}
 
 
-def _score_views(run: Path, twin: Twin, truth: Truth, true_of_found: dict[int, int]) -> tuple[dict, dict]:
+def _score_views(
+    run: Path, twin: Twin, truth: Truth, true_of_found: dict[int, int], masks: Path | None
+) -> tuple[dict, dict]:
     views: dict[str, Any] = {"psnr": None, "ssim": None, "lpips": None, "lpips_why_null": NO_LPIPS}
     try:
         capture, max_size = _capture_of(run)
-        scores = score_views(run, twin, truth, true_of_found, capture, max_size)
+        scores = score_views(run, twin, truth, true_of_found, capture, max_size, masks)
     except HingesplatError as e:
         return views | {"why_null": str(e)}, {"part_iou": None}
     views |= {

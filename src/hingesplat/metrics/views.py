@@ -56,17 +56,18 @@ def score_views(
     true_of_found: dict[int, int],
     capture: Path,
     max_size: int | None = None,
+    masks: Path | None = None,
 ) -> ViewScores:
     """Render the run at every test view of its capture and compare.
 
     Args:
         true_of_found: part id of the twin → index of the true part; ids not in it match nothing.
-        max_size: photographs longer than this are reduced first, as in ``load_capture``.
+        max_size, masks: as in ``load_capture``.
 
     Raises:
         HingesplatError: Gaussians or photographs missing, no test view, or a part-id picture of another size.
     """
-    states = load_capture(capture, max_size=max_size).states[:2]
+    states = load_capture(capture, max_size=max_size, masks=masks).states[:2]
     if not all(state.test for state in states):
         raise HingesplatError(f"{capture}: a state has no test views to compare with")
     dbs: list[list[float]] = [[], []]
