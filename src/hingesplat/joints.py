@@ -14,7 +14,15 @@ from hingesplat.capture import View
 from hingesplat.chains import closest_joint, parents_of
 from hingesplat.gaussians import Gaussians
 from hingesplat.optim import GaussianAdam, LearningRates
-from hingesplat.poses import StateLossConfig, draw_state, part_centres, pose_loss, pose_step, state_loss
+from hingesplat.poses import (
+    StateLossConfig,
+    draw_state,
+    errors_by_part,
+    part_centres,
+    pose_loss,
+    pose_step,
+    state_loss,
+)
 from hingesplat.se3 import rotvec_to_matrix
 from hingesplat.stereo import DepthMap
 from hingesplat.symmetry import round_about
@@ -218,7 +226,9 @@ def _choose_types(
             R, t = poses.Rt()
             pose_loss(g, R[state + 1], t[state + 1], view, config.render.ssim_weight, sh[state + 1]).backward()
             pose_step(adam, config.rate, step / config.type_steps)
-        losses[kind] = _losses_by_part(g, sh, training, poses, n_joints)
+        with torch.no_grad():
+            R, t = poses.Rt()
+        losses[kind] = errors_by_part(g, R, t, training, sh)
         if kind == "revolute":
             offset = (part_centres(g, n_joints + 1)[1:] - poses.pivot()).detach()
             reach = torch.linalg.cross(offset, poses.axis().detach(), dim=1).norm(dim=1) / poses.extent
@@ -239,26 +249,6 @@ def _choose_types(
         certainty = z - config.type_significance if hinged else max(config.type_significance - z, 0.0)
         confidence[j] = 0.5 * (1 + math.erf(certainty / math.sqrt(2)))
     return kinds, confidence
-
-
-@torch.no_grad()
-def _losses_by_part(
-    g: Gaussians, sh: Tensor, training: Sequence[Sequence[TrainingView]], poses: JointPoses, n_joints: int
-) -> np.ndarray:
-    """(views, joints) mean absolute error of each moved photograph over the pixels near each part; NaN where unseen."""
-    membership = torch.nn.functional.one_hot(g.part, n_joints + 1).float()[:, 1:]
-    R, t = poses.Rt()
-    rows = []
-    for s in range(1, len(training)):
-        for view in training[s]:
-            r = draw_state(g, R[s], t[s], view.camera, sh_offset=sh[s], background=torch.ones(3), channels=membership)
-            error = (r.rgba - view.image).abs().mean(0)
-            tall = torch.nn.functional.max_pool2d(r.channels[None], (15, 1), 1, (7, 0))
-            region = torch.nn.functional.max_pool2d(tall, (1, 15), 1, (0, 7))[0] > 0.3
-            area = region.flatten(1).sum(1)
-            mean = (error * region).flatten(1).sum(1) / area.clamp_min(1)
-            rows.append(torch.where(area > 30, mean, torch.nan).numpy())
-    return np.stack(rows)
 
 
 def _standard_deviations(

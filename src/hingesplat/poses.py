@@ -1,7 +1,9 @@
 """Differentiable part poses, and the Gaussians of one state drawn with them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -75,6 +77,39 @@ def pose_loss(
     """What one photograph says of its state's part poses alone: L_render of Gaussians that are what they are."""
     r = draw_state(g, R, t, view.camera, sh_offset=sh_offset, background=torch.ones(3))
     return photometric(r.rgba, view.target, ssim_weight)
+
+
+@torch.no_grad()
+def errors_by_part(
+    g: Gaussians,
+    R: Tensor,
+    t: Tensor,
+    training: Sequence[Sequence[TrainingView]],
+    state_sh: Tensor | None = None,
+) -> np.ndarray:
+    """How well photographs agree with each part's poses, where the part is drawn.
+
+    Args:
+        R, t: (states, parts, 3, 3) and (states, parts, 3) poses.
+        training: photographs of every state; those of state 0 are not asked.
+        state_sh: (states, n, 3) colour offsets.
+
+    Returns:
+        (views, parts − 1) mean absolute error over the pixels near each moving part; NaN where it is hardly seen.
+    """
+    membership = torch.nn.functional.one_hot(g.part, R.shape[1]).float()[:, 1:]
+    rows = []
+    for s in range(1, len(training)):
+        offset = None if state_sh is None else state_sh[s]
+        for view in training[s]:
+            r = draw_state(g, R[s], t[s], view.camera, sh_offset=offset, background=torch.ones(3), channels=membership)
+            error = (r.rgba - view.image).abs().mean(0)
+            tall = torch.nn.functional.max_pool2d(r.channels[None], (15, 1), 1, (7, 0))
+            region = torch.nn.functional.max_pool2d(tall, (1, 15), 1, (0, 7))[0] > 0.3
+            area = region.flatten(1).sum(1)
+            mean = (error * region).flatten(1).sum(1) / area.clamp_min(1)
+            rows.append(torch.where(area > 30, mean, torch.nan).numpy())
+    return np.stack(rows)
 
 
 def pose_step(adam: torch.optim.Adam, rate: float, progress: float, end: float = 0.02) -> None:
