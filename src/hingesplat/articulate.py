@@ -103,7 +103,7 @@ def articulate(
     extra = {"state_sh": (torch.zeros((len(canonical), len(views) - 1, 3)), config.rates.sh)}
     optimiser = GaussianAdam(canonical, config.rates, extent, extra | identity.extra | targets.extra)
     training = training_views(views, maps)
-    if first and config.identity.kind == "hard":
+    if first and config.identity.kind == "hard" and config.align_steps:
         _align(canonical, poses, training, config, rng)
     photographs = shuffled(training, rng)
     statistics = torch.zeros((len(optimiser), 3))

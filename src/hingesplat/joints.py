@@ -226,8 +226,7 @@ def _choose_types(
             R, t = poses.Rt()
             pose_loss(g, R[state + 1], t[state + 1], view, config.render.ssim_weight, sh[state + 1]).backward()
             pose_step(adam, config.rate, step / config.type_steps)
-        with torch.no_grad():
-            R, t = poses.Rt()
+        R, t = poses.Rt()
         losses[kind] = errors_by_part(g, R, t, training, sh)
         if kind == "revolute":
             offset = (part_centres(g, n_joints + 1)[1:] - poses.pivot()).detach()

@@ -148,8 +148,8 @@ def segment(
     """
     rng = np.random.default_rng(seed)
     low, high, surfaces = survey(gaussians, views, maps, config)
-    extent = float((high - low).max())
     evidence, seeds = gather(surfaces, low, high, config, rng)
+    extent = evidence.extent
     pool = propose(evidence, seeds)
     n_seeds = sum(len(i) for i in seeds)
     if not pool:
