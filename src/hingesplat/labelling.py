@@ -9,6 +9,7 @@ from functools import cache
 from itertools import combinations
 
 import numpy as np
+import torch
 from scipy.sparse import csr_matrix
 from scipy.spatial import KDTree
 
@@ -110,7 +111,7 @@ class Labelling:
             columns = []
             for T in [np.eye(4), *T_1_0]:
                 carried = moved(self.surfaces[s].points, T if s == 0 else np.linalg.inv(T))
-                distance, index = map(np.asarray, self.trees[1 - s].query(carried))
+                distance, index = map(np.asarray, self.trees[1 - s].query(carried, workers=torch.get_num_threads()))
                 columns.append(np.where(distance < 0.025 * self.extent, index, -1))
             result.append(np.stack(columns, 1))
         return result

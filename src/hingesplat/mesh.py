@@ -198,7 +198,7 @@ def _solid_unseen(
     hull = _hull_grid(surface, lower, distance.shape, voxel)
     inside = unseen & hull
     index = np.argwhere(inside)
-    away, _ = KDTree(surface).query(lower + voxel * index, distance_upper_bound=reach)
+    away, _ = KDTree(surface).query(lower + voxel * index, distance_upper_bound=reach, workers=torch.get_num_threads())
     wall = inside & ~np.asarray(ndimage.binary_erosion(hull, iterations=max(round(reach / voxel), 1)), bool)
     wall[tuple(index.T)] |= np.isfinite(away)
     pocket = np.zeros(distance.shape, np.int32)

@@ -33,7 +33,7 @@ class LearningRates:
 
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
-NUMBERS_PER_THREAD = 32_768
+NUMBERS_PER_THREAD = 2**18
 """With fewer, another thread costs more than it brings."""
 
 

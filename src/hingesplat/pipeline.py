@@ -163,6 +163,8 @@ class Run:
     capture: Capture
     config: ReconstructConfig
     report: Report
+    maps: dict[int, list[DepthMap]] = field(default_factory=dict)
+    """What stereo found in each state, once it has been read."""
 
     def __truediv__(self, name: str) -> Path:
         return self.folder / name
@@ -492,8 +494,10 @@ def _fitted(run: Run, state: int) -> Gaussians:
 
 
 def _depth(run: Run, state: int) -> list[DepthMap]:
-    known, views = load_file(run / f"depth_state{state}.safetensors"), run.views[state]
-    return [depth_map(view, known[str(i)].numpy()) for i, view in enumerate(views)]
+    if state not in run.maps:
+        known, views = load_file(run / f"depth_state{state}.safetensors"), run.views[state]
+        run.maps[state] = [depth_map(view, known[str(i)].numpy()) for i, view in enumerate(views)]
+    return run.maps[state]
 
 
 def _depths(run: Run) -> list[list[DepthMap]]:

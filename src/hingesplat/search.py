@@ -121,7 +121,8 @@ def _sum(q, colours, shift, origin, inverse_voxel, score, volume_colour, give_up
                 square += s * (e0 * e0 + e1 * e1 + e2 * e2)
             else:
                 penalty += s
-        if i == m // 4 and welcome + unseen + penalty < give_up * i:
+        # Most places are hopeless: a few points say so, for a worse sum than a fair one of theirs would be.
+        if (i == m // 16 or i == m // 4) and welcome + unseen + penalty < give_up * i - (2 if i < m // 4 else 0):
             return np.float32(-1)
     if welcome > 0:
         offset = (mean0 * mean0 + mean1 * mean1 + mean2 * mean2) / welcome

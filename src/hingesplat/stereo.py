@@ -74,6 +74,8 @@ TRUNCATE = 0.2
 
 WITNESSES = 64
 """Depth maps that a point is held against where every map's points are."""
+POINTS_PER_THREAD = 16_384
+"""With fewer, another thread costs more than it brings."""
 
 
 @dataclass(frozen=True)
@@ -188,9 +190,10 @@ def contradicted(points: np.ndarray, maps: Sequence[DepthMap], tolerance: float)
 def _votes(points: np.ndarray, maps: Sequence[DepthMap], tolerance: float) -> tuple[np.ndarray, np.ndarray]:
     """How many maps put their surface within ``tolerance`` of each point (n, 3), and how many twice as far behind."""
     same, through = np.zeros(len(points), int), np.zeros(len(points), int)
+    threads = min(torch.get_num_threads(), 1 + len(points) // POINTS_PER_THREAD)
     for m in maps:
         P = m.camera.K @ m.camera.T_camera_world[:3]
-        parallel(_vote, torch.get_num_threads(), points, P, m.depth, tolerance, same, through)
+        parallel(_vote, threads, points, P, m.depth, tolerance, same, through)
     return same, through
 
 

@@ -19,10 +19,14 @@ def write_obj(mesh: trimesh.Trimesh, path: Path) -> None:
     lines = [f"mtllib {path.stem}.mtl", f"usemtl {path.stem}"]
     lines += [
         f"v {x:.7g} {y:.7g} {z:.7g} {r:.4g} {g:.4g} {b:.4g}"
-        for (x, y, z), (r, g, b) in zip(mesh.vertices, rgb / 255, strict=True)
+        for (x, y, z), (r, g, b) in zip(
+            mesh.vertices.tolist(), (rgb / 255).tolist(), strict=True
+        )  # floats of Python format fast
     ]
-    lines += [f"vt {u:.5f} {v:.5f}" for u, v in uv.reshape(-1, 2)]
-    lines += [f"f {a}/{3 * i + 1} {b}/{3 * i + 2} {c}/{3 * i + 3}" for i, (a, b, c) in enumerate(mesh.faces + 1)]
+    lines += [f"vt {u:.5f} {v:.5f}" for u, v in uv.reshape(-1, 2).tolist()]
+    lines += [
+        f"f {a}/{3 * i + 1} {b}/{3 * i + 2} {c}/{3 * i + 3}" for i, (a, b, c) in enumerate((mesh.faces + 1).tolist())
+    ]
     write_text(path, "\n".join(lines) + "\n")
 
 

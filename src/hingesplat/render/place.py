@@ -12,7 +12,7 @@ from hingesplat.render._place import place_backward, place_forward
 from hingesplat.se3 import matrix_to_wxyz, quat_multiply
 from hingesplat.simd import parallel
 
-GAUSSIANS_PER_THREAD = 4096
+GAUSSIANS_PER_THREAD = 16_384
 """With fewer, another thread costs more than it brings."""
 
 
