@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hingesplat.screw import matrix_to_screw, prismatic, revolute
+from hingesplat.screw import joint_motion, matrix_to_screw
 from hingesplat.se3 import moved
 
 STRAY = 0.004
@@ -37,7 +37,7 @@ def misfit(T: np.ndarray, points: np.ndarray) -> float:
     errors = []
     for kind in ("prismatic", "revolute"):
         axis, pivot, values = closest_joint(kind, T, centroid)
-        joints = [prismatic(axis, v) if kind == "prismatic" else revolute(axis, pivot, v) for v in values]
+        joints = [joint_motion(kind, axis, pivot, v) for v in values]
         gaps = [moved(points, M) - moved(points, J) for M, J in zip(T, joints, strict=True)]
         errors.append(float(np.linalg.norm(gaps, axis=2).mean()))
     return min(errors)

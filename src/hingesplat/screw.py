@@ -83,6 +83,11 @@ def prismatic(axis: ArrayLike, slide: float) -> Float[np.ndarray, "4 4"]:
     return screw_to_matrix(Screw(_unit(axis), np.zeros(3), 0.0, slide))
 
 
+def joint_motion(kind: str, axis: ArrayLike, pivot: ArrayLike, value: float) -> Float[np.ndarray, "4 4"]:
+    """Where a joint at ``value`` takes its part, (4, 4): ``revolute`` if its kind is that, else ``prismatic``."""
+    return revolute(axis, pivot, value) if kind == "revolute" else prismatic(axis, value)
+
+
 def revolute_torch(
     axis: Float[Tensor, "*batch 3"], pivot: Float[Tensor, "*batch 3"], angle: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch 4 4"]:

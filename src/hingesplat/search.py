@@ -14,7 +14,7 @@ import torch
 from numba import njit
 from scipy.ndimage import distance_transform_edt
 
-from hingesplat.screw import prismatic, revolute
+from hingesplat.screw import joint_motion
 from hingesplat.se3 import moved
 from hingesplat.simd import parallel
 from hingesplat.visibility import FREE, SURFACE, Sight, ask
@@ -262,9 +262,7 @@ class Motion:
     @property
     def T(self) -> np.ndarray:
         """4×4 from this state's configuration to the other's."""
-        if self.kind == "prismatic":
-            return self.after @ prismatic(self.axis, self.value)
-        return self.after @ revolute(self.axis, self.pivot, self.value)
+        return self.after @ joint_motion(self.kind, self.axis, self.pivot, self.value)
 
 
 def inverted(motion: Motion) -> Motion:

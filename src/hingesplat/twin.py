@@ -9,6 +9,7 @@ import numpy as np
 
 from hingesplat.errors import HingesplatError
 from hingesplat.files import write_json
+from hingesplat.screw import joint_motion
 
 VERSION = 1
 JointType = Literal["revolute", "prismatic", "fixed"]
@@ -60,15 +61,7 @@ class Joint:
 
     def transform(self, value: float) -> np.ndarray:
         """T_parent: moves the part's state-0 geometry to joint value ``value``; 4×4, frame of state 0."""
-        T = np.eye(4)
-        axis = np.asarray(self.axis)
-        if self.type == "prismatic":
-            T[:3, 3] = axis * value
-        elif self.type == "revolute":
-            K = np.cross(np.eye(3), axis)  # K v = axis × v
-            R = np.eye(3) + np.sin(value) * K + (1 - np.cos(value)) * K @ K
-            T[:3, :3], T[:3, 3] = R, np.asarray(self.pivot) - R @ np.asarray(self.pivot)
-        return T
+        return np.eye(4) if self.type == "fixed" else joint_motion(self.type, self.axis, self.pivot, value)
 
 
 @dataclass(frozen=True)

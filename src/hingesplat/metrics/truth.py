@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 
 from hingesplat.errors import HingesplatError
-from hingesplat.screw import prismatic, revolute
+from hingesplat.screw import joint_motion
 
 PARIS_STATES = ("start", "end")
 
@@ -41,9 +41,7 @@ class TruthJoint:
 
     def transform(self) -> np.ndarray:
         """The motion from state 0 to state 1 relative to the parent, 4×4."""
-        if self.type == "revolute":
-            return revolute(self.axis, self.pivot, self.motion)
-        return prismatic(self.axis, self.motion)
+        return joint_motion(self.type, self.axis, self.pivot, self.motion)
 
 
 @dataclass(frozen=True)
@@ -119,8 +117,7 @@ def _load_tree(folder: Path, tree: dict[str, Any]) -> Truth:
                 j = by_child[name]
                 value = float(j[f"state{state}"])
                 axis, origin = _unit(j["axis"], where), _vector(j["origin"], where)
-                turns = _type(j["type"], where) == "revolute"
-                local = revolute(axis, origin, value) if turns else prismatic(axis, value)
+                local = joint_motion(_type(j["type"], where), axis, origin, value)
                 poses[state][name] = poses[state][j["parent"]] @ local
         parts = []
         for name in names:
