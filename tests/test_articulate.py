@@ -70,14 +70,23 @@ def test_parts_far_off_are_aligned_before_anything_is_painted_anew(kind) -> None
     assert distance(left.T_state_0, made) == pytest.approx(start, rel=1e-3)
 
 
-def test_an_alignment_that_photographs_hardly_like_better_is_undone(monkeypatch) -> None:
-    """A door went astray that way: its photographs liked the wrong place better by two per cent."""
+@pytest.mark.parametrize("astray", [True, False])
+def test_an_alignment_that_photographs_hardly_like_better_must_leave_the_part_on_its_surface(
+    monkeypatch, astray
+) -> None:
+    """One door left its hinge for two per cent; another came from 11° off to 1° for less than that."""
     made = scene("revolute", 64, 0.06)
     errors = iter([np.array([0.0689]), np.array([0.0673])])
     monkeypatch.setattr("hingesplat.articulate._mean_errors", lambda *_: next(errors))
-    found, _ = run(made, replace(CONFIG, steps=1, pose_rate=0.0, align_steps=40), degrees=8.0)
-    start = distance(off_by(made, 8.0), made)
-    assert distance(found.T_state_0, made) == pytest.approx(start, rel=1e-3)
+    wild = {"align_steps": 4, "align_rate": 0.3}
+    config = replace(CONFIG, steps=1, pose_rate=0.0, **(wild if astray else {"align_steps": 240}))
+    before = 2.0 if astray else 8.0
+    found, _ = run(made, config, degrees=before)
+    start = distance(off_by(made, before), made)
+    if astray:
+        assert distance(found.T_state_0, made) == pytest.approx(start, rel=1e-3)
+    else:
+        assert distance(found.T_state_0, made) < 0.2 * start
 
 
 def test_the_base_and_state_0_stay_and_poses_are_rigid() -> None:
