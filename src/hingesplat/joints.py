@@ -16,7 +16,7 @@ from hingesplat.gaussians import Gaussians
 from hingesplat.optim import GaussianAdam, LearningRates
 from hingesplat.poses import (
     StateLossConfig,
-    draw_state,
+    drawn_parts,
     errors_by_part,
     part_centres,
     pose_loss,
@@ -196,7 +196,7 @@ def find_joints(
     offsets = optimiser.values["state_sh"].detach().permute(1, 0, 2)
     all_sh = torch.cat([torch.zeros_like(offsets[:1]), offsets]).contiguous()
     deviation = _standard_deviations(finished, all_sh, training, poses, config)
-    seen = _views_that_show(finished, training, poses, config)
+    seen = _views_that_show(finished, training, poses)
     pixel = float(np.median([_pixel(v.camera, finished) for state in training for v in state]))
     joints = _joints(kinds, poses, finished, confidence, deviation, seen, sum(len(s) for s in training), pixel)
     return JointResult(finished, all_sh, joints)
@@ -300,19 +300,10 @@ def _standard_deviations(
     return deviation
 
 
-@torch.no_grad()
-def _views_that_show(
-    g: Gaussians, training: Sequence[Sequence[TrainingView]], poses: JointPoses, config: JointsConfig
-) -> np.ndarray:
+def _views_that_show(g: Gaussians, training: Sequence[Sequence[TrainingView]], poses: JointPoses) -> np.ndarray:
     """(joints,) number of photographs in which a part covers at least 30 pixels."""
-    membership = torch.nn.functional.one_hot(g.part, len(poses.axis0) + 1).float()[:, 1:]
-    R, t = poses.Rt()
-    count = np.zeros(len(poses.axis0), int)
-    for s, state in enumerate(training):
-        for view in state:
-            r = draw_state(g, R[s], t[s], view.camera, channels=membership)
-            count += ((r.channels > 0.5).flatten(1).sum(1) >= 30).numpy()
-    return count
+    shown = [(r.channels > 0.5).flatten(1).sum(1) >= 30 for _, r in drawn_parts(g, *poses.Rt(), training)]
+    return torch.stack(shown).sum(0).numpy()
 
 
 def _ambiguity(kind: JointType, points: np.ndarray, axis: np.ndarray, pivot: np.ndarray) -> str:

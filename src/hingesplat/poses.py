@@ -1,6 +1,6 @@
 """Differentiable part poses, and the Gaussians of one state drawn with them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,6 +80,26 @@ def pose_loss(
 
 
 @torch.no_grad()
+def drawn_parts(
+    g: Gaussians, R: Tensor, t: Tensor, training: Sequence[Sequence[TrainingView]], state_sh: Tensor | None = None
+) -> Iterator[tuple[TrainingView, Rendering]]:
+    """Every photograph, and what its camera sees over white; its channels are the shares of the moving parts.
+
+    Args:
+        R, t: (states, parts, 3, 3) and (states, parts, 3) poses.
+        training: photographs of every state.
+        state_sh: (states, n, 3) colour offsets.
+    """
+    membership, white = torch.nn.functional.one_hot(g.part, R.shape[1]).float()[:, 1:], torch.ones(3)
+    for s, views in enumerate(training):
+        offset = None if state_sh is None else state_sh[s]
+        for view in views:
+            yield (
+                view,
+                draw_state(g, R[s], t[s], view.camera, sh_offset=offset, background=white, channels=membership),
+            )
+
+
 def errors_by_part(
     g: Gaussians,
     R: Tensor,
@@ -87,28 +107,21 @@ def errors_by_part(
     training: Sequence[Sequence[TrainingView]],
     state_sh: Tensor | None = None,
 ) -> np.ndarray:
-    """How well photographs agree with each part's poses, where the part is drawn.
+    """How well photographs agree with each part's poses, where the part is drawn; those of state 0 are not asked.
 
-    Args:
-        R, t: (states, parts, 3, 3) and (states, parts, 3) poses.
-        training: photographs of every state; those of state 0 are not asked.
-        state_sh: (states, n, 3) colour offsets.
+    Arguments as for ``drawn_parts``.
 
     Returns:
         (views, parts − 1) mean absolute error over the pixels near each moving part; NaN where it is hardly seen.
     """
-    membership = torch.nn.functional.one_hot(g.part, R.shape[1]).float()[:, 1:]
     rows = []
-    for s in range(1, len(training)):
-        offset = None if state_sh is None else state_sh[s]
-        for view in training[s]:
-            r = draw_state(g, R[s], t[s], view.camera, sh_offset=offset, background=torch.ones(3), channels=membership)
-            error = (r.rgba - view.image).abs().mean(0)
-            tall = torch.nn.functional.max_pool2d(r.channels[None], (15, 1), 1, (7, 0))
-            region = torch.nn.functional.max_pool2d(tall, (1, 15), 1, (0, 7))[0] > 0.3
-            area = region.flatten(1).sum(1)
-            mean = (error * region).flatten(1).sum(1) / area.clamp_min(1)
-            rows.append(torch.where(area > 30, mean, torch.nan).numpy())
+    for view, r in drawn_parts(g, R[1:], t[1:], training[1:], None if state_sh is None else state_sh[1:]):
+        error = (r.rgba - view.image).abs().mean(0)
+        tall = torch.nn.functional.max_pool2d(r.channels[None], (15, 1), 1, (7, 0))
+        region = torch.nn.functional.max_pool2d(tall, (1, 15), 1, (0, 7))[0] > 0.3
+        area = region.flatten(1).sum(1)
+        mean = (error * region).flatten(1).sum(1) / area.clamp_min(1)
+        rows.append(torch.where(area > 30, mean, torch.nan).numpy())
     return np.stack(rows)
 
 
