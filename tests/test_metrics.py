@@ -211,6 +211,7 @@ def test_the_truth_itself_scores_nought(capture: Path, tmp_path: Path) -> None:
         assert door[key] == pytest.approx(0, abs=1e-6)
     assert drawer["motion_units"] == pytest.approx(0, abs=1e-9) and drawer["motion_deg"] is None
     assert metrics["cd"]["whole"] < 0.5 and max(metrics["cd"]["movable"]) < 0.2 and metrics["cd"]["static"] < 0.4
+    assert metrics["volumes"] == pytest.approx([1, 1, 1], abs=1e-6)
     assert metrics["penetration"]["volume_fraction"] < 0.005
     assert metrics["part_iou"] > 0.75
     assert metrics["views"]["psnr"] > 5 and 0 < metrics["views"]["ssim"] < 1

@@ -179,6 +179,11 @@ def spread(values: Sequence[float | None], digits: int) -> str:
     return text if len(there) < 2 else f"{text} ± {np.std(there):.{digits}f}"
 
 
+def volumes_off(row: Row) -> list[float]:
+    """Percent by which the volumes of a run's parts are off, where they are known."""
+    return [100 * abs(v - 1) for v in row["metrics"].get("volumes", []) if v is not None]
+
+
 def parts_right(row: Row) -> bool:
     return row["metrics"]["parts_found"] == row["metrics"]["parts_true"]
 
@@ -227,6 +232,7 @@ def cells(rows: Sequence[Row]) -> dict[str, str]:
         "CD-s": spread([number_of(r, "cd_static") for r in good], 2),
         "CD-m": spread([number_of(r, "cd_movable") for r in good], 2),
         "CD-w": spread([number_of(r, "cd_whole") for r in good], 2),
+        "volume off, %": spread([max(volumes_off(r), default=None) for r in good], 0),
         "penetration": spread([number_of(r, "penetration") for r in good], 3),
         "seconds": spread(seconds("total"), 0),
         "fit s": spread(seconds("stereo", "fit"), 0),
@@ -266,6 +272,7 @@ def overview(rows: Sequence[Row]) -> dict[str, str]:
         "CD-s": middle([number_of(r, "cd_static") for r in good], 2),
         "CD-m": middle([number_of(r, "cd_movable") for r in good], 2, worst=True),
         "CD-w": middle([number_of(r, "cd_whole") for r in good], 2),
+        "volume off, %": middle([v for r in good for v in volumes_off(r)], 0, worst=True),
         "penetration": middle([number_of(r, "penetration") for r in good], 3),
         "PSNR": middle([number_of(r, "psnr") for r in good], 1),
         "minutes": middle([number_of(r, "minutes") for r in good], 1),
@@ -322,9 +329,10 @@ def write_page(page: Path, rows: Sequence[Row], out: Path) -> Path:
         "deviation over seeds; a seed draws the object as well as every random choice. Truth is opened after a run",
         "has ended, and the last iterate counts. *Given* is what a method was told: `parts` is the true number of",
         "parts; joint types are told to none. A joint that was not found counts 90°. Chamfer distances as in the",
-        "literature (squared, both directions, × 1000), penetration as a fraction of a part's volume. Times are one",
-        "run's alone; first stages taken over from another run count as they were measured there. A dash stands where",
-        "the machine had other work, too.",
+        "literature (squared, both directions, × 1000), penetration as a fraction of a part's volume, volume off as what",
+        "the worst part's lacks or has too much (the median over parts in tables of methods). Times are one run's alone;",
+        "first stages taken over from another run count as they were measured there. A dash stands where the machine had",
+        "other work, too, or where a run was recorded before a figure was taken.",
         "",
         *_machines(rows),
     ]

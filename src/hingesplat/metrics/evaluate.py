@@ -69,6 +69,7 @@ def evaluate(
         "superfluous_parts": len(twin.parts) - len(true_of_found),
         "joints": [_joint(known, i, twin, found_of_true) for i in range(len(known.joints))],
         "cd": _chamfers(known, found, found_of_true),
+        "volumes": _volumes(known, found, found_of_true),
         "penetration": _penetrations(twin, found),
         "views": views,
         **part_iou,
@@ -182,6 +183,17 @@ def _chamfers(truth: Truth, found: Sequence[FoundPart], found_of_true: dict[int,
         }
 
     return named(np.mean(rows[0] + rows[1], axis=0)) | {"start": named(np.mean(rows[0], axis=0))}
+
+
+def _volumes(truth: Truth, found: Sequence[FoundPart], found_of_true: dict[int, int]) -> list[float | None]:
+    """Each true part's volume as found, over the true one; None for a part not found, or where a mesh is not closed."""
+    mesh_of = {p.id: p.meshes[0] for p in found}
+    ratios: list[float | None] = []
+    for k, part in enumerate(truth.parts):
+        true, ours = part.meshes[0], mesh_of.get(found_of_true.get(k, -1))
+        closed = ours is not None and true.is_watertight and ours.is_watertight and true.volume > 0
+        ratios.append(float(ours.volume / true.volume) if ours is not None and closed else None)
+    return ratios
 
 
 def _penetrations(twin: Twin, found: Sequence[FoundPart]) -> dict[str, Any]:
