@@ -484,6 +484,14 @@ def test_a_piece_seen_in_one_state_only_is_no_part() -> None:
         assert [set(found) for found in labels] == [{0, 1}, {0, 1}]
 
 
+def test_a_motion_that_one_state_shows_nothing_of_is_none() -> None:
+    """Speckles of a white wall had been matched with speckles elsewhere: each piece was in one state only."""
+    here, there = plain(np.concatenate([BASE, PART])), plain(np.concatenate([BASE, patch((0.9, 0.4, 0))]))
+    label = np.repeat([0, 1], [400, 225])
+    motions, labels = split_pieces([SHIFT], (label, label), (here, there), 1.0, 25)
+    assert motions == [] and not labels[0].any() and not labels[1].any()
+
+
 def test_a_piece_goes_back_to_the_part_that_it_moves_with() -> None:
     """Two motions nearly the same share a part between them, and the smaller share touches the larger."""
     stray, far = patch((0.16, 0, 0)), patch((0.8, 0, 0), 20)

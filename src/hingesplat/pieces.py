@@ -12,6 +12,8 @@ from hingesplat.surface import Labels, Surface, components
 
 LARGE_PIECE = 0.2
 """A piece this large beside the largest of its part is a part of its own, not a fragment."""
+LEAST_SHARE = 0.002
+"""Of each state's surface: a part that shows less of itself in one of them has no way from there to here."""
 SURE = 0.4
 """A fragment that costs so much more with what it touches, on average, stays what it is."""
 
@@ -32,7 +34,8 @@ def split_pieces(
 ) -> tuple[list[Motion], Labels]:
     """One part is one piece: two large pieces far apart that share a motion become two parts with that motion.
 
-    Two doors one above the other, turned by the same angle about the same line, are such a pair.
+    Two doors one above the other, turned by the same angle about the same line, are such a pair. A motion no piece of
+    which is seen in both states is none, and its points are base.
     """
     owned = _rejoined(motions, owned, surfaces, extent)
     result: list[Motion] = []
@@ -46,7 +49,11 @@ def split_pieces(
         large = size >= max(LARGE_PIECE * size.max(), 5 * min_points)
         both = np.minimum(*each) >= min_points
         large &= both
-        large[np.where(both, size, 0).argmax() if both.any() else size.argmax()] = size.max() > 0
+        if both.any():
+            large[np.where(both, size, 0).argmax()] = True
+        else:
+            main = int(size.argmax())
+            large[main] = all(e[main] > LEAST_SHARE * len(o) for e, o in zip(each, owned, strict=True))
         for p in np.flatnonzero(large):
             result.append(motion)
             for s in (0, 1):
