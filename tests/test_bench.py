@@ -177,6 +177,16 @@ def test_captures_are_a_section_of_their_own(runner: Runner, options: BenchOptio
         bench(options, ("hingesplat",), tmp_path / "photos" / "untold", told)
 
 
+def test_a_capture_named_like_a_made_object_is_not_taken_for_it(
+    runner: Runner, options: BenchOptions, tmp_path: Path
+) -> None:
+    (tmp_path / "photos" / "laptop" / "truth").mkdir(parents=True)
+    bench(replace(options, objects=("laptop",), seeds=(0,)), ("hingesplat",), tmp_path / "photos", told)
+    assert runner.count("synth") == 1 and runner.count("reconstruct") == 2
+    bare = [r for r in load_rows(options.out) if r["views"] is None]
+    assert len(bare) == 1
+
+
 @pytest.mark.parametrize(("objects", "methods"), [(("teapot",), ("hingesplat",)), ((), ("dta",))])
 def test_unknown_names_are_said(options: BenchOptions, objects, methods) -> None:
     with pytest.raises(HingesplatError, match="no such"):

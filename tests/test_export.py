@@ -110,8 +110,7 @@ def test_mujoco_puts_every_link_where_the_twin_does(cabinet: Made, tmp_path: Pat
     for name, pose in link_poses(cabinet[0], VALUES, **options).items():
         assert data.body(name).xpos == pytest.approx(pose[:3, 3], abs=1e-6)
         assert data.body(name).xmat.reshape(3, 3) == pytest.approx(pose[:3, :3], abs=1e-6)
-    if form == "mjcf":
-        assert model.opt.gravity == pytest.approx([0, -9.81, 0] if options else [0, 0, -9.81])
+    assert model.opt.gravity == pytest.approx([0, -9.81, 0] if options else [0, 0, -9.81])
 
 
 def test_pybullet_and_yourdfpy_put_every_link_where_the_twin_does(cabinet: Made, tmp_path: Path, hulls: Path):
@@ -391,6 +390,22 @@ def test_a_part_without_a_base_is_refused(cabinet: Made, tmp_path: Path):
             config = ExportConfig(extend_limits=extend)
             export_twin(loop, cabinet[1], random_gaussians(3, 0), tmp_path / "out", config=config)
     assert not (tmp_path / "out").exists()
+
+
+def test_hulls_of_one_part_are_not_taken_for_another_of_its_name(tmp_path: Path, hulls: Path):
+    mujoco = pytest.importorskip("mujoco")
+    walls = [box((0.4, 0.02, 0.2), (0, y, 0), (90, 90, 90)) for y in (-0.2, 0.2)]
+    tray = trimesh.boolean.union([*walls, box((0.4, 0.4, 0.02), (0, 0, -0.1), (90, 90, 90))])
+    parts = tuple(Part(i, "drawer", 5) for i in range(3))
+    joints = tuple(Joint(i, 0, "prismatic", (1.0, 0, 0), (0, 0, 0), (0, 0.1), (0, 0.1)) for i in (1, 2))
+    meshes = {0: box((0.5, 0.5, 0.5), (0, 0, 1), (90, 90, 90)), 1: tray, 2: box((0.1, 0.1, 0.1), (1, 0, 0), (9, 9, 9))}
+    model = mujoco.MjModel.from_xml_path(str(export((Twin(parts, joints), meshes), tmp_path, "mjcf", hulls)))
+    assert model.nmesh > 3 + 3  # Three are seen; the tray collides as three at least.
+
+
+def test_too_few_triangles_are_refused(cabinet: Made, tmp_path: Path, hulls: Path):
+    with pytest.raises(HingesplatError, match="max_triangles"):
+        export(cabinet, tmp_path, "urdf", hulls, max_triangles=3)
 
 
 def test_names_are_fit_for_every_format(hulls: Path):

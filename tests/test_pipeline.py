@@ -252,10 +252,10 @@ def test_depth_is_found_by_stereo_or_taken_as_measured(cabinet: Path, tmp_path: 
         assert np.mean(z > there - 0.05) > 0.9  # On the surface or behind it, not in front.
 
 
-def test_a_capture_without_depth_pictures_has_none_measured(capture: Capture, tmp_path: Path) -> None:
+def test_a_capture_without_depth_pictures_has_none_to_measure(capture: Capture, tmp_path: Path) -> None:
     run = Run(tmp_path, capture, ReconstructConfig(depth=True), lambda **_: None)
-    pipeline._stereo(run)
-    assert all((m.depth == 0).all() for t in (0, 1) for m in pipeline._depth(run, t))
+    with pytest.raises(HingesplatError, match="state 0 has no depth pictures"):
+        pipeline._stereo(run)
 
 
 def small_config() -> ReconstructConfig:

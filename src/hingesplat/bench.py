@@ -176,7 +176,7 @@ def run_all(cases: Sequence[Case], options: BenchOptions, homes: dict[str, Path]
             home = work / f"{subject}_{seed}_{views}_{size}"
             mine = [c for c in missing if (c.subject, c.seed, c.views, c.size) == (subject, seed, views, size)]
             for case in mine:
-                row = measure(case, homes.get(subject), home, options.out)
+                row = measure(case, homes.get(subject) if views is None else None, home, options.out)
                 done += 1
                 how = row.get("error") or f"{row['summary']['seconds']['total'] / 60:.1f} min"
                 if options.busy and "summary" in row:
@@ -211,7 +211,10 @@ def measure(case: Case, capture: Path | None, home: Path, out: Path) -> Row:
     told = case.options
     if case.method in TOLD_K:
         told = {"parts": "K"} | told
-    told = {k: number_of_parts(v, capture) if k == "parts" else v for k, v in told.items()}
+    try:
+        told = {k: number_of_parts(v, capture) if k == "parts" else v for k, v in told.items()}
+    except HingesplatError as e:
+        return row | {"error": str(e).replace(str(capture), case.subject)}
     args = ["--preset", case.preset, "--method", case.method, "--seed", str(case.seed)]
     args += [word for k, v in told.items() for word in (f"--{k}", v)]
     parents = [str(p) for p in sorted(home.iterdir()) if (p / "stages.json").is_file() and p != run]

@@ -80,13 +80,15 @@ class View:
     """Address to listen on; 0.0.0.0 lets other machines in."""
     port: int = 8080
     """Port to listen on."""
+    masks: Path | None = None
+    """Folder with one mask per photograph, as `reconstruct` was given it."""
     quiet: bool = False
     """Say nothing but warnings and errors."""
 
     def run(self, console: Console) -> None:
         from hingesplat.viewer import open_viewer
 
-        with open_viewer(self.folder, host=self.host, port=self.port) as viewer:
+        with open_viewer(self.folder, host=self.host, port=self.port, masks=self.masks) as viewer:
             console.print(f"{viewer.url} shows {escape(str(self.folder))}; Ctrl-C ends it", soft_wrap=True)
             with suppress(KeyboardInterrupt):
                 threading.Event().wait()
@@ -623,7 +625,7 @@ def _write_traceback(command: Command | None) -> Path:
     folder = getattr(command, "log_folder", None)
     path = (
         folder / "log.txt"
-        if folder is not None and folder.is_dir()
+        if folder is not None and (folder / "config.json").is_file()  # Else it is no run yet, and must stay empty.
         else Path(tempfile.gettempdir()) / "hingesplat-log.txt"
     )
     with suppress(OSError), path.open("a", encoding="utf-8") as file:

@@ -34,6 +34,7 @@ def write_json(path: Path, data: Any) -> Path:
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
     """A folder to write into that takes the place of ``path`` when all went well, and is gone when not."""
+    path = path.resolve()
     tmp = path.with_name(path.name + ".tmp")
     shutil.rmtree(tmp, ignore_errors=True)
     tmp.mkdir(parents=True)

@@ -250,6 +250,8 @@ def _run_stages(run: Run, curves: Curves) -> None:
 def _stereo(run: Run) -> None:
     for t, views in enumerate(run.views):
         config = run.config.stereo
+        if run.config.depth and all(view.depth is None for view in views):
+            raise HingesplatError(f"depth: {run.capture.path}, state {t} has no depth pictures; leave out --depth")
         maps = measured(views, config.image_size) if run.config.depth else stereo(views, config)
         write_tensors(
             run / f"depth_state{t}.safetensors", {str(i): torch.from_numpy(m.depth) for i, m in enumerate(maps)}
@@ -508,6 +510,8 @@ def _depths(run: Run) -> list[list[DepthMap]]:
 def _check(config: ReconstructConfig) -> None:
     if config.parts != "auto" and config.parts < 2:
         raise HingesplatError(f"parts: must be auto, or at least 2 (the base and a mover), not {config.parts}")
+    if config.seed < 0:
+        raise HingesplatError(f"seed: must be at least 0, not {config.seed}")
     if config.max_size is not None and config.max_size < 1:
         raise HingesplatError(f"max_size: must be at least 1 pixel, not {config.max_size}")
     if config.start.labels != "search" and config.parts == "auto":

@@ -1,9 +1,11 @@
 """The third noun: a base, movable parts, and the joints between them. ``twin.json`` is its file."""
 
 import json
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -120,7 +122,7 @@ class Twin:
         """Read ``twin.json``.
 
         Raises:
-            HingesplatError: missing, broken, of another version, or lacking a key.
+            HingesplatError: missing, broken, of another version, lacking a key, or no tree of parts and joints.
         """
         if not path.is_file():
             raise HingesplatError(f"{path}: no such file; run `hingesplat reconstruct` first")
@@ -142,8 +144,47 @@ class Twin:
                 )
                 for j in data["joints"]
             )
-            return Twin(parts, joints, data["units"], data["metres_per_unit"])
-        except json.JSONDecodeError as e:
-            raise HingesplatError(f"{path}: not valid JSON (line {e.lineno})") from e
+            twin = Twin(parts, joints, data["units"], data["metres_per_unit"])
+        except (json.JSONDecodeError, UnicodeDecodeError) as e:
+            raise HingesplatError(f"{path}: not valid JSON ({e})") from e
         except (KeyError, TypeError) as e:
             raise HingesplatError(f"{path}: key {e} missing or unknown") from e
+        if fault := _fault(twin):
+            raise HingesplatError(f"{path}: {fault}")
+        return twin
+
+
+def _fault(twin: Twin) -> str | None:
+    """What is wrong with a twin that somebody else may have written, in words."""
+    ids = [part.id for part in twin.parts]
+    if len(set(ids)) < len(ids):
+        return "parts: two have one id"
+    parent_of = {}
+    for joint in twin.joints:
+        where = f"the joint of part {joint.child}"
+        if joint.child not in ids or joint.child == 0 or joint.child in parent_of:
+            return f"{where}: its child is no part, the base, or has another joint"
+        if joint.parent not in ids:
+            return f"{where}: its parent, {joint.parent}, is no part"
+        if joint.type not in get_args(JointType):
+            return f"{where}: type {joint.type!r}; use {', '.join(get_args(JointType))}"
+        if not (_are_numbers(joint.axis, 3) and _are_numbers(joint.pivot, 3) and np.linalg.norm(joint.axis) > 1e-9):
+            return f"{where}: axis and pivot must be three numbers each, and the axis not zero"
+        if not _are_numbers(joint.limits, 2) or joint.limits[0] > joint.limits[1]:
+            return f"{where}: limits must be two numbers, the lower first"
+        if not _are_numbers(joint.states, len(twin.joints[0].states)):
+            return f"{where}: states must be numbers, as many as those of the other joints"
+        parent_of[joint.child] = joint.parent
+    for part in parent_of:
+        chain = [part]
+        while chain[-1] in parent_of:
+            chain.append(parent_of[chain[-1]])
+            if chain[-1] == part:
+                return f"part {part} hangs from itself; mend joints[].parent"
+            if len(chain) > len(ids):
+                break  # The ring is another's, who will be named.
+    return None
+
+
+def _are_numbers(values: Sequence[Any], count: int) -> bool:
+    return len(values) == count and all(isinstance(v, int | float) and math.isfinite(v) for v in values)

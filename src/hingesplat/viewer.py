@@ -74,8 +74,10 @@ class Viewer:
         self.close()
 
 
-def open_viewer(path: Path, *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
+def open_viewer(path: Path, *, host: str = "127.0.0.1", port: int = 8080, masks: Path | None = None) -> Viewer:
     """Serve a run, or a capture, until the viewer is closed; ``port`` 0 takes a free one.
+
+    ``masks`` are those of ``load_capture``.
 
     Raises:
         HingesplatError: the folder is neither, or broken; the port is taken; there is no such host.
@@ -84,7 +86,7 @@ def open_viewer(path: Path, *, host: str = "127.0.0.1", port: int = 8080) -> Vie
         raise HingesplatError(f"{path}: {'is not a folder' if path.exists() else 'does not exist'}")
     _check_address(host, port)
     if (path / "twin.json").is_file():
-        show = _open_run(path)
+        show = _open_run(path, masks)
     elif (path / "config.json").is_file():
         raise HingesplatError(f"{path}: this run has no twin yet; finish it with the same `hingesplat reconstruct`")
     else:
@@ -92,7 +94,7 @@ def open_viewer(path: Path, *, host: str = "127.0.0.1", port: int = 8080) -> Vie
             recognise(path)
         except HingesplatError as e:
             raise HingesplatError(f"{path}: is no run, for it has no twin.json, and no capture ({e})") from e
-        show = _open_capture(path)
+        show = _open_capture(path, masks)
     with redirect_stdout(io.StringIO()):  # It greets, quiet or not.
         server = viser.ViserServer(host=host, port=port, verbose=False)
     server.gui.configure_theme(show_logo=False, show_share_button=False)
@@ -113,19 +115,19 @@ def _check_address(host: str, port: int) -> None:
         raise HingesplatError(f"cannot listen on {host}, port {port} ({e.strerror}); {remedy}") from e
 
 
-def _open_run(folder: Path) -> "Callable[[viser.ViserServer], TwinView]":
+def _open_run(folder: Path, masks: Path | None) -> "Callable[[viser.ViserServer], TwinView]":
     gaussians, twin = load_result(folder)
     meshes, repel, source = load_meshes(folder, twin), repel_points_of(folder), capture_of(folder)
     capture = None
     try:
-        capture = load_capture(source, max_size=PHOTO) if source else None
+        capture = load_capture(source, max_size=PHOTO, masks=masks) if source else None
     except HingesplatError as e:
         log.warning("without its photographs: %s", e)
     return lambda server: TwinView(server, gaussians, twin, meshes, repel, capture)
 
 
-def _open_capture(path: Path) -> "Callable[[viser.ViserServer], CaptureView]":
-    capture, hulls = load_capture(path, max_size=PHOTO), []
+def _open_capture(path: Path, masks: Path | None) -> "Callable[[viser.ViserServer], CaptureView]":
+    capture, hulls = load_capture(path, max_size=PHOTO, masks=masks), []
     for state in capture.states:
         try:
             hulls.append(_surface(*visual_hull(state.train, HULL)))

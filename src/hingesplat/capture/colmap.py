@@ -110,7 +110,7 @@ def _frame(image: _Image, lenses: dict[int, _Lens], root: Path, where: str) -> F
         )
     T_world_camera = np.linalg.inv(rigid(T_camera_world, where))
     camera = Camera(T_world_camera, lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height)
-    return Frame(camera, path, path.relative_to(root).as_posix())
+    return Frame(camera, path, (path.relative_to(root) if path.is_relative_to(root) else path).as_posix())
 
 
 def _lens(model: str, width: int, height: int, params: tuple[float, ...], where: str) -> _Lens:

@@ -89,7 +89,7 @@ def export_twin(
                 case "urdf":
                     from hingesplat.export.urdf import write_urdf
 
-                    path = write_urdf(links, folder)
+                    path = write_urdf(links, folder, up_axis=config.up_axis)
                 case "mjcf":
                     from hingesplat.export.mjcf import write_mjcf
 

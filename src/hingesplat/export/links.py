@@ -20,6 +20,8 @@ from hingesplat.files import write_text
 from hingesplat.twin import Joint, Part, Twin
 
 GRAVITY = 9.81
+FEWEST_TRIANGLES = 100
+"""With fewer, a simplified mesh may vanish."""
 UP = {"z": np.eye(3), "y": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
 """R_export_twin by the axis that points up in the export; twins have z up."""
 PLACES = 9
@@ -94,12 +96,14 @@ def build_links(twin: Twin, meshes: dict[int, trimesh.Trimesh], config: ExportCo
         cache: a folder that keeps collision hulls from one export to the next.
 
     Raises:
-        HingesplatError: the density or scale is not positive; a joint names a parent that does not exist, or
-            the joints form a loop.
+        HingesplatError: the density or scale is not positive; too few triangles are allowed; a joint names a parent
+            that does not exist, or the joints form a loop.
     """
     for name in ("density", "scale"):
         if not 0 < getattr(config, name) < float("inf"):
             raise HingesplatError(f"{name}: must be above 0, not {getattr(config, name)}")
+    if config.max_triangles < FEWEST_TRIANGLES:
+        raise HingesplatError(f"max_triangles: must be at least {FEWEST_TRIANGLES}, not {config.max_triangles}")
     order, names = _parents_first(twin), _unique_names(twin)
     solids = {i: closed_mesh(mesh, names[i], config.max_triangles) for i, mesh in meshes.items() if i in names}
     solids = {i: mesh for i, mesh in solids.items() if mesh is not None}
@@ -121,6 +125,11 @@ def build_links(twin: Twin, meshes: dict[int, trimesh.Trimesh], config: ExportCo
 def placement(twin: Twin, config: ExportConfig) -> tuple[np.ndarray, float]:
     """Rotation (3, 3) and factor that take the twin's coordinates to the export's: ``factor · R x``."""
     return UP[config.up_axis], config.scale * twin.metres_per_unit
+
+
+def gravity(up_axis: str) -> list[float]:
+    """(3,) m/s² in the export's frame."""
+    return [-GRAVITY * (up_axis == axis) for axis in "xyz"]
 
 
 def shapes(link: Link) -> list[tuple[str, str, str, trimesh.Trimesh]]:

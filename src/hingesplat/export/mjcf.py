@@ -4,7 +4,7 @@ from pathlib import Path
 
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
-from hingesplat.export.links import GRAVITY, Link, joint_dynamics, numbers, servo_gain, touching, write_meshes
+from hingesplat.export.links import GRAVITY, Link, gravity, joint_dynamics, numbers, servo_gain, touching, write_meshes
 from hingesplat.files import write_text
 
 
@@ -21,9 +21,8 @@ def write_mjcf(links: list[Link], out: Path, *, up_axis: str = "z") -> Path:
     write_meshes(links, out)
     root = etree.Element("mujoco", model="twin")
     etree.SubElement(root, "compiler", angle="radian", autolimits="true")
-    down = [-float(up_axis == axis) for axis in "xyz"]
-    gravity = numbers([GRAVITY * v for v in down])
-    etree.SubElement(root, "option", integrator="implicitfast", timestep="0.002", gravity=gravity)
+    down = [v / GRAVITY for v in gravity(up_axis)]
+    etree.SubElement(root, "option", integrator="implicitfast", timestep="0.002", gravity=numbers(gravity(up_axis)))
     _add_defaults(root)
     asset = etree.SubElement(root, "asset")
     world = etree.SubElement(root, "worldbody")
@@ -68,7 +67,7 @@ def _add_assets(asset: etree._Element, link: Link) -> None:
     # Inertia comes from the link; for the mesh asset itself any will do, and a shell's never fails.
     etree.SubElement(asset, "mesh", name=link.name, file=f"meshes/{link.name}.obj", inertia="shell")
     for i in range(len(link.hulls)):
-        etree.SubElement(asset, "mesh", name=f"{link.name}_{i}", file=f"collision/{link.name}_{i}.obj")
+        etree.SubElement(asset, "mesh", name=f"{link.name}_collision_{i}", file=f"collision/{link.name}_{i}.obj")
 
 
 def _add_body(parent: etree._Element, link: Link, links: list[Link]) -> etree._Element:
@@ -91,5 +90,5 @@ def _add_body(parent: etree._Element, link: Link, links: list[Link]) -> etree._E
     if link.mesh is not None:
         etree.SubElement(body, "geom", **{"class": "visual", "mesh": link.name, "material": link.name})
         for i in range(len(link.hulls)):
-            etree.SubElement(body, "geom", **{"class": "collision", "mesh": f"{link.name}_{i}"})
+            etree.SubElement(body, "geom", **{"class": "collision", "mesh": f"{link.name}_collision_{i}"})
     return body

@@ -4,16 +4,17 @@ from pathlib import Path
 
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
-from hingesplat.export.links import Link, joint_dynamics, numbers, shapes, write_meshes
+from hingesplat.export.links import Link, gravity, joint_dynamics, numbers, shapes, write_meshes
 from hingesplat.files import write_text
 
 
-def write_urdf(links: list[Link], out: Path) -> Path:
+def write_urdf(links: list[Link], out: Path, *, up_axis: str = "z") -> Path:
     """Write ``out/twin.urdf`` with ``out/meshes/`` and ``out/collision/``; paths inside are relative.
 
     Joint value 0 is state 0. URDF cannot exempt a part from touching the base it is hinged to, so a
     ``<mujoco>`` tag, which other programs ignore, switches contacts off in MuJoCo; use the MJCF to grasp and
-    push there. The tag also names the integrator with which stiff servos on light chains are stable.
+    push there. The tag also names the integrator with which stiff servos on light chains are stable, and which way is
+    down.
 
     Returns:
         The URDF's path.
@@ -22,7 +23,8 @@ def write_urdf(links: list[Link], out: Path) -> Path:
     robot = etree.Element("robot", name="twin")
     mujoco = etree.SubElement(robot, "mujoco")
     etree.SubElement(mujoco, "compiler", strippath="false", discardvisual="false", fusestatic="false")
-    etree.SubElement(etree.SubElement(mujoco, "option", integrator="implicitfast"), "flag", contact="disable")
+    option = etree.SubElement(mujoco, "option", integrator="implicitfast", gravity=numbers(gravity(up_axis)))
+    etree.SubElement(option, "flag", contact="disable")
     for link in links:
         _add_link(robot, link)
     for link in links:

@@ -52,6 +52,8 @@ def make(
         raise HingesplatError(f"{name}: no such object; there are {', '.join(NAMES)}")
     if size < 16 or train_views < 1 or test_views < 0:
         raise HingesplatError(f"size {size}, views {train_views} + {test_views}: need ≥ 16 pixels and ≥ 1 view")
+    if seed < 0:
+        raise HingesplatError(f"seed: must be at least 0, not {seed}")
     if states < 2 or not 0 <= below < 1:
         raise HingesplatError(f"{states} states, {below} of the views from below: need ≥ 2 states and 0 ≤ share < 1")
     out = Path(out)
