@@ -63,7 +63,8 @@ def table(found: dict[str, Any]) -> str:
     rows.append(("all stages", f"{total:.1f}", "", f"{max(s['peak_memory_mb'] or 0 for s in stages.values()):.0f}"))
     if "wall_seconds" in found:
         rows.append(("with loading, evaluation and report", f"{found['wall_seconds']:.1f}", "", ""))
-    told = f"{found['gaussians']:,} Gaussians in {found['parts']} parts, preset {found['preset']}, {found['threads']}"
+    what = "The demo with its own settings" if "wall_seconds" in found else f"Preset {found['preset']}"
+    told = f"{what}: {found['gaussians']:,} Gaussians in {found['parts']} parts, {found['threads']}"
     head = ("stage", "seconds", "share", "most memory so far, MB")
     return "\n".join([markdown(head, rows), "", f"{told}.", f"Machine: {found['machine']}."])
 

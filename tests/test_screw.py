@@ -1,19 +1,14 @@
-"""Laws of screws: round trips at every angle, numpy and torch agree, Kabsch, line distances."""
+"""Laws of screws: round trips at every angle, line distances."""
 
 import numpy as np
 import pytest
-import torch
-from torch.autograd import gradcheck
 
 from hingesplat.screw import (
     Screw,
-    fit_rigid,
     line_distance,
     matrix_to_screw,
     prismatic,
-    prismatic_torch,
     revolute,
-    revolute_torch,
     screw_to_matrix,
 )
 
@@ -82,64 +77,6 @@ def test_an_axis_without_length_is_refused() -> None:
         revolute((0, 0, 0), (0, 0, 0), 1.0)
     with pytest.raises(ValueError, match="no direction"):
         line_distance((0, 0, 0), (1, 0, 0), (0, 0, 0), (0, 0, 0))
-
-
-def test_torch_joints_equal_numpy_joints_and_batch() -> None:
-    rng = np.random.default_rng(2)
-    axis, pivot, angle = rng.normal(size=(5, 3)), rng.normal(size=(5, 3)), rng.normal(size=5)
-    turned = revolute_torch(*map(torch.from_numpy, (axis, pivot, angle)))
-    moved = prismatic_torch(torch.from_numpy(axis), torch.from_numpy(angle))
-    for i in range(5):
-        np.testing.assert_allclose(turned[i], revolute(axis[i], pivot[i], angle[i]), atol=1e-12)
-        np.testing.assert_allclose(moved[i], prismatic(axis[i], angle[i]), atol=1e-12)
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-6, 1.0, np.pi])
-def test_gradients_of_torch_joints(angle: float) -> None:
-    def leaf(*values: float) -> torch.Tensor:
-        return torch.tensor(values, dtype=torch.float64, requires_grad=True)
-
-    value = torch.tensor(angle, dtype=torch.float64, requires_grad=True)
-    assert gradcheck(revolute_torch, (leaf(1, 2, 3), leaf(0.1, -2, 0.5), value))
-    assert gradcheck(prismatic_torch, (leaf(1, 2, 3), value))
-
-
-def test_fit_rigid_finds_the_motion_and_weights_shut_out_outliers() -> None:
-    rng = np.random.default_rng(3)
-    a, T = rng.normal(size=(40, 3)), screw_to_matrix(Screw(random_unit(rng), rng.normal(size=3), 2.0, 0.5))
-    b = a @ T[:3, :3].T + T[:3, 3]
-    np.testing.assert_allclose(fit_rigid(a, b), T, atol=1e-12)
-    b[:5] += 10
-    weights = np.r_[np.zeros(5), rng.uniform(0.1, 1, 35)]
-    np.testing.assert_allclose(fit_rigid(a, b, weights), T, atol=1e-12)
-    assert not np.allclose(fit_rigid(a, b), T, atol=1e-2)
-
-
-def test_fit_rigid_is_a_rotation_even_for_mirrored_or_flat_points() -> None:
-    rng = np.random.default_rng(4)
-    a = rng.normal(size=(2, 20, 3))
-    a[1, :, 2] = 0
-    T = fit_rigid(a, a * [1, 1, -1])
-    np.testing.assert_allclose(np.linalg.det(T[:, :3, :3]), 1)
-    np.testing.assert_allclose(T[1], np.eye(4), atol=1e-12)  # A flat mirror image is also a plain match.
-
-
-def test_fit_rigid_beats_its_neighbours() -> None:
-    rng = np.random.default_rng(5)
-    a, b, w = rng.normal(size=(15, 3)), rng.normal(size=(15, 3)), rng.uniform(size=15)
-    T = fit_rigid(a, b, w)
-
-    def cost(T: np.ndarray) -> float:
-        return float((w * ((a @ T[:3, :3].T + T[:3, 3] - b) ** 2).sum(1)).sum())
-
-    for _ in range(30):
-        nudge = screw_to_matrix(Screw(random_unit(rng), rng.normal(size=3), 1e-3, 1e-3 * rng.normal()))
-        assert cost(nudge @ T) > cost(T)
-
-
-def test_fit_rigid_refuses_weights_of_nothing() -> None:
-    with pytest.raises(ValueError, match="positive sum"):
-        fit_rigid(np.eye(3), np.eye(3), np.zeros(3))
 
 
 def test_line_distance() -> None:

@@ -15,7 +15,15 @@ from hingesplat.identity import Free, Identity, IdentityConfig, identity_of, par
 from hingesplat.losses.part import soft_motion
 from hingesplat.optim import GaussianAdam, LearningRates
 from hingesplat.physics import PhysicsConfig, RepelConfig, Repulsion, Targets, one_hot, physics_loss
-from hingesplat.poses import PoseDelta, StateLossConfig, errors_by_part, part_centres, pose_loss, pose_step, state_loss
+from hingesplat.poses import (
+    PoseDelta,
+    StateLossConfig,
+    errors_by_part,
+    move_parts_alone,
+    part_centres,
+    pose_step,
+    state_loss,
+)
 from hingesplat.slots import SlotsConfig, living_slots
 from hingesplat.stereo import DepthMap
 from hingesplat.training import Report, TrainingView, averaged, grow, shuffled, training_views
@@ -156,13 +164,8 @@ def _align(
     """
     some = [state[:: max(len(state) // JUDGES, 1)] for state in training]
     before, off = _mean_errors(canonical, poses, some), _misfits(canonical, poses, fitted, extent)
-    adam = torch.optim.Adam(poses.parameters, lr=config.align_rate)
-    photographs = shuffled(training[1:], rng)
-    for step in range(config.align_steps):
-        state, view = next(photographs)
-        R, t = poses.Rt()
-        pose_loss(canonical, R[state + 1], t[state + 1], view, config.render.ssim_weight).backward()
-        pose_step(adam, config.align_rate, step / config.align_steps, end=0.1)
+    steps, rate = config.align_steps, config.align_rate
+    move_parts_alone(canonical, poses, training, steps, rate, config.render.ssim_weight, rng, end=0.1)
     after, still_on = _mean_errors(canonical, poses, some), _misfits(canonical, poses, fitted, extent) < off + ASTRAY
     good = (after < BETTER * before) | ((after < before) & still_on)
     with torch.no_grad():

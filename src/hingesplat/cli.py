@@ -275,13 +275,13 @@ class Demo:
 
 
 def demo_config() -> "ReconstructConfig":
-    """The standard preset cut to the demo's 200 pixels."""
+    """The standard preset with fewer Gaussians, for the demo's 200 pixels, and longer over them."""
     from hingesplat.pipeline import ReconstructConfig
 
     config = ReconstructConfig()
     return replace(
         config,
-        fit=replace(config.fit, steps=1000, start_gaussians=3000, max_gaussians=8000),
+        fit=replace(config.fit, start_gaussians=3000, max_gaussians=8000),
         articulate=replace(config.articulate, steps=1700, max_gaussians=16_000),
         mesh=replace(config.mesh, views=32, image_size=200),
     )

@@ -18,6 +18,7 @@ from hingesplat.poses import (
     StateLossConfig,
     drawn_parts,
     errors_by_part,
+    move_parts_alone,
     part_centres,
     pose_loss,
     pose_step,
@@ -103,6 +104,10 @@ class JointPoses:
         # Two tilts of the axis, two shifts of the pivot across it, then a change of the value in every state.
         self.theta = torch.zeros((len(types), 4 + len(values)), requires_grad=True)
 
+    @property
+    def parameters(self) -> list[Tensor]:
+        return [self.theta]
+
     def axis(self) -> Tensor:
         tilt = (self.theta[:, :2, None] * self.across).sum(1)
         return torch.nn.functional.normalize(self.axis0 + tilt, dim=1)
@@ -180,7 +185,7 @@ def find_joints(
     poses = poses_of(kinds)
     extra = {"state_sh": (state_sh[1:].permute(1, 0, 2), config.rates.sh)}
     optimiser = GaussianAdam(gaussians, config.rates, extent, extra)
-    adam = torch.optim.Adam([poses.theta], lr=config.rate)
+    adam = torch.optim.Adam(poses.parameters, lr=config.rate)
     photographs = shuffled(training, rng)
     tell = averaged(report, config.steps)
     for step in range(config.steps):
@@ -219,13 +224,8 @@ def _choose_types(
     losses, reach = {}, torch.zeros(n_joints)
     for kind in ("prismatic", "revolute"):
         poses = poses_of([kind] * n_joints)
-        adam = torch.optim.Adam([poses.theta], lr=config.rate)
-        photographs = shuffled(training[1:], rng)
-        for step in range(config.type_steps):
-            state, view = next(photographs)
-            R, t = poses.Rt()
-            pose_loss(g, R[state + 1], t[state + 1], view, config.render.ssim_weight, sh[state + 1]).backward()
-            pose_step(adam, config.rate, step / config.type_steps)
+        weight = config.render.ssim_weight
+        move_parts_alone(g, poses, training, config.type_steps, config.rate, weight, rng, state_sh=sh)
         R, t = poses.Rt()
         losses[kind] = errors_by_part(g, R, t, training, sh)
         if kind == "revolute":

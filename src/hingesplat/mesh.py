@@ -1,9 +1,9 @@
 """Part meshes: fuse depth of all states into one signed distance grid a part, then close it.
 
-Depth is that of the Gaussians, and where stereo contradicts it, that of stereo: fits put lids on hollows. A view of
-any state carves a part in the part's own frame. What no view ever saw is solid behind the surfaces that were seen, as
-thick as a wall, and farther in where these close around it; but two parts are never in one place, so the base has room
-for its movers all along their way.
+Depth is that of stereo where it is known, else that of the Gaussians unless stereo sees through it: fits put lids on
+hollows. A view of any state carves a part in the part's own frame. What no view ever saw is solid behind the surfaces
+that were seen, as thick as a wall, and farther in where these close around it; but two parts are never in one place, so
+the base has room for its movers all along their way.
 """
 
 import logging
@@ -288,12 +288,12 @@ def _rendered(
 def _correct(
     depth: np.ndarray, part: np.ndarray, scene: Gaussians, maps: Sequence[DepthMap], number: int, limit: float
 ) -> None:
-    """Put in, in place, what stereo knows better: its depth where the two differ, nothing where it sees through."""
+    """Put in, in place, what stereo knows: its depth where it has one, nothing where it sees through what is drawn."""
     camera, known = maps[number].camera, maps[number].depth
     y, x = np.nonzero(np.isfinite(depth) & (known == 0))
     lid = contradicted(camera.lifted(x, y, depth[y, x]), maps, limit)
     depth[y[lid], x[lid]], part[y[lid], x[lid]] = np.nan, -1
-    # Where they agree, the rendered depth is the smoother one.
+    # Where the two differ, whose surface it is has to be asked anew.
     y, x = np.nonzero((known > 0) & ((part < 0) | ~(np.abs(known - depth) < 0.5 * limit)))
     depth[known > 0] = known[known > 0]
     seen = scene[scene.opacities > 0.1]

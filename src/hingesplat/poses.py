@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from hingesplat.losses.photometric import photometric
 from hingesplat.optim import GaussianAdam
 from hingesplat.render import Rendering, place, rasterize
 from hingesplat.se3 import rotvec_to_matrix
-from hingesplat.training import TrainingView, view_loss
+from hingesplat.training import TrainingView, shuffled, view_loss
 
 
 class PoseDelta:
@@ -77,6 +78,43 @@ def pose_loss(
     """What one photograph says of its state's part poses alone: L_render of Gaussians that are what they are."""
     r = draw_state(g, R, t, view.camera, sh_offset=sh_offset, background=torch.ones(3))
     return photometric(r.rgba, view.target, ssim_weight)
+
+
+class Movable(Protocol):
+    """Part poses that a few numbers decide."""
+
+    @property
+    def parameters(self) -> list[Tensor]: ...
+    def Rt(self) -> tuple[Tensor, Tensor]: ...
+
+
+def move_parts_alone(
+    g: Gaussians,
+    poses: Movable,
+    training: Sequence[Sequence[TrainingView]],
+    steps: int,
+    rate: float,
+    ssim_weight: float,
+    rng: np.random.Generator,
+    *,
+    state_sh: Tensor | None = None,
+    end: float = 0.02,
+) -> None:
+    """Improve ``poses`` on the photographs of the moved states by Adam, nothing else changing.
+
+    Args:
+        training: photographs of every state; those of state 0 are not asked.
+        rate: Adam step; decays to ``end`` of itself.
+        state_sh: (states, n, 3) colour offsets.
+    """
+    adam = torch.optim.Adam(poses.parameters, lr=rate)
+    photographs = shuffled(training[1:], rng)
+    for step in range(steps):
+        before, view = next(photographs)
+        state, (R, t) = before + 1, poses.Rt()
+        offset = None if state_sh is None else state_sh[state]
+        pose_loss(g, R[state], t[state], view, ssim_weight, offset).backward()
+        pose_step(adam, rate, step / steps, end)
 
 
 @torch.no_grad()

@@ -1,17 +1,15 @@
 """Rigid motion ↔ screw: turn by an angle about an axis through a pivot, slide along the same axis.
 
-Right-handed about the axis, radians, scene units. Numpy float64; the two ``_torch`` functions are the same
-joints for optimisers. Chasles' theorem: every rigid motion is one such screw, up to the sign of its axis.
+Right-handed about the axis, radians, scene units; numpy float64. Chasles' theorem: every rigid motion is one such
+screw, up to the sign of its axis.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
 STRAIGHT = 1e-9
 """Radians. Below it a motion counts as a pure slide: the rounding of a matrix alone turns by 1e-16."""
@@ -88,54 +86,6 @@ def joint_motion(kind: str, axis: ArrayLike, pivot: ArrayLike, value: float) -> 
     return revolute(axis, pivot, value) if kind == "revolute" else prismatic(axis, value)
 
 
-def revolute_torch(
-    axis: Float[Tensor, "*batch 3"], pivot: Float[Tensor, "*batch 3"], angle: Float[Tensor, "*batch"]
-) -> Float[Tensor, "*batch 4 4"]:
-    """``revolute`` with gradients to all three; smooth at every angle. The axis is normalised here."""
-    a = torch.nn.functional.normalize(axis, dim=-1)
-    zero = torch.zeros_like(a[..., 0])
-    x, y, z = a.unbind(-1)
-    K = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
-    turn = angle.sin()[..., None, None] * K + 2 * (angle / 2).sin().square()[..., None, None] * (K @ K)
-    return _from_turn(turn, -(turn @ pivot[..., None])[..., 0])
-
-
-def prismatic_torch(axis: Float[Tensor, "*batch 3"], slide: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 4 4"]:
-    """``prismatic`` with gradients to both. The axis is normalised here."""
-    t = torch.nn.functional.normalize(axis, dim=-1) * slide[..., None]
-    return _from_turn(torch.zeros_like(t)[..., None].expand(*t.shape, 3), t)
-
-
-def fit_rigid(
-    points_a: Shaped[np.ndarray, "*batch n 3"],
-    points_b: Shaped[np.ndarray, "*batch n 3"],
-    weights: Shaped[np.ndarray, "*batch n"] | None = None,
-) -> Float[np.ndarray, "*batch 4 4"]:
-    """The rigid ``T_b_a`` (..., 4, 4) of least Σ w ‖T_b_a a − b‖² over paired points (..., n, 3).
-
-    Kabsch (1976) with weights, never a reflection. With fewer than three points off one line the rotation is
-    one of many that fit equally well.
-
-    Raises:
-        ValueError: the weights of a problem sum to nothing.
-    """
-    a, b = np.asarray(points_a, float), np.asarray(points_b, float)
-    w = np.ones(a.shape[:-1]) if weights is None else np.asarray(weights, float)
-    total = w.sum(-1, keepdims=True)
-    if not np.all(total > 0):
-        raise ValueError("fit_rigid: the weights must have a positive sum")
-    w = (w / total)[..., None]
-    centre_a, centre_b = (w * a).sum(-2, keepdims=True), (w * b).sum(-2, keepdims=True)
-    covariance = np.swapaxes(w * (b - centre_b), -1, -2) @ (a - centre_a)
-    U, _, Vt = np.linalg.svd(covariance)
-    U[..., :, 2] *= np.linalg.det(U @ Vt)[..., None]
-    R = U @ Vt
-    T = np.zeros((*a.shape[:-2], 4, 4))
-    T[..., :3, :3], T[..., 3, 3] = R, 1
-    T[..., :3, 3] = centre_b[..., 0, :] - (R @ np.swapaxes(centre_a, -1, -2))[..., 0]
-    return T
-
-
 def line_distance(p: ArrayLike, d: ArrayLike, q: ArrayLike, e: ArrayLike) -> float:
     """Shortest distance of the lines p + s·d and q + u·e, all (3,); point to line when they are parallel.
 
@@ -161,10 +111,3 @@ def _unit(axis: ArrayLike) -> np.ndarray:
 
 def _cross_matrix(a: np.ndarray) -> np.ndarray:
     return np.cross(np.eye(3), a)  # K v = a × v
-
-
-def _from_turn(turn: Tensor, t: Tensor) -> Tensor:
-    """(..., 3, 3) R − I and (..., 3) translation to (..., 4, 4)."""
-    top = torch.cat([turn, t[..., None]], -1)
-    step = torch.cat([top, torch.zeros_like(top[..., :1, :])], -2)
-    return torch.eye(4, dtype=t.dtype, device=t.device) + step

@@ -37,11 +37,6 @@ def rotvec_to_matrix(rotvec: Tensor) -> Tensor:
     return roma.rotvec_to_rotmat(rotvec)
 
 
-def matrix_to_rotvec(R: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) to axis times angle (..., 3), angle in [0, π]."""
-    return roma.rotmat_to_rotvec(R)
-
-
 def from_Rt(R: Tensor, t: Tensor) -> Tensor:
     """Rotation (..., 3, 3) and translation (..., 3) to a 4×4 transform."""
     T = torch.zeros((*R.shape[:-2], 4, 4), dtype=R.dtype, device=R.device)

@@ -2,8 +2,8 @@
 
 Seeds are surface points that the other state's cameras would see floating in free space: they must have moved. Every
 motion of one degree of freedom is tried on them (``search``), the fewest motions that explain most seeds are kept
-(description length), and all Gaussians of both states then vote for a label, each with its neighbours and with the
-place where its label says it went.
+(description length), and all surface points of both states then vote for a label, each with its neighbours and with
+the place where its label says it went; Gaussians take that of the nearest point.
 """
 
 from collections.abc import Sequence

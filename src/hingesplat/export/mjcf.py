@@ -12,8 +12,8 @@ def write_mjcf(links: list[Link], out: Path, *, up_axis: str = "z") -> Path:
     """Write ``out/twin.xml`` with ``out/meshes/`` and ``out/collision/``; paths inside are relative.
 
     Every joint has a critically damped position actuator, in radians or metres. Contacts are excluded between
-    a part and its parent (MuJoCo does not filter them when the parent is static) and between parts that touch
-    in state 0. Geoms: group 2 what is seen, group 3 collision hulls. Gravity pulls against ``up_axis``.
+    a part and its parent (MuJoCo does not filter them when the parent is static) and between parts that meet
+    on their ways. Geoms: group 2 what is seen, group 3 collision hulls. Gravity pulls against ``up_axis``.
 
     Returns:
         The MJCF's path.

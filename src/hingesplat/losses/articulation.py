@@ -25,7 +25,7 @@ def articulation_loss(
     """L_art = mean_i ‖μ_i^(1) − target_i‖² + λ_rot · mean_k angle(R_k, R̂_k); square units and radians.
 
     ``moved`` are the Gaussians of state 0 carried to state 1 (``part.soft_motion``), ``target`` their matches
-    there, ``R_hat`` the rotations estimated from those matches (``screw.fit_rigid``). The paper gives no
+    there, ``R_hat`` the rotations estimated from those matches (``velocity.fit_parts``). The paper gives no
     λ_rot. Means instead of sums, so that the weight holds for any number of Gaussians and parts.
     """
     return (moved - target).square().sum(-1).mean() + lambda_rot * rotation_angle(R, R_hat).mean()
