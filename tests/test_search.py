@@ -76,7 +76,7 @@ def test_scan_looks_where_another_part_takes_the_seeds_then(kind: str) -> None:
     after = revolute((0.0, 1.0, 0.0), (0.2, 0.0, 0.1), 0.4)
     seeds, colours = displaced(a.points[rows], np.linalg.inv(after)), a.blurred()[rows]
     T_true = (revolute(AXIS, PIVOT, ANGLE) if kind == "revolute" else prismatic(FORWARD, SLIDE)) @ after
-    best = scan(seeds, colours, np.eye(3) @ after[:3, :3], volume, after=after, keep=6)[0]
+    best = scan(kind, seeds, colours, np.eye(3) @ after[:3, :3], volume, after=after, keep=6)[0]
     error = np.linalg.norm(displaced(seeds, best.T) - displaced(seeds, T_true), axis=1).mean()
     assert best.kind == kind and error < 1.5 * volume.voxel
 
@@ -91,7 +91,7 @@ def test_scan_recovers_a_motion_within_the_grid(kind: str) -> None:
     rows = np.random.default_rng(0).choice(np.flatnonzero(moves), 64, replace=False)
     seeds, colours = a.points[rows], a.blurred()[rows]
     T_true = revolute(AXIS, PIVOT, ANGLE) if kind == "revolute" else prismatic(FORWARD, SLIDE)
-    found = scan(seeds, colours, np.eye(3), volume, keep=6)
+    found = scan(kind, seeds, colours, np.eye(3), volume, keep=6)
     assert found == sorted(found, key=lambda m: -m.score)
     best = found[0]
     assert best.kind == kind
@@ -111,9 +111,7 @@ def test_given_values_and_a_given_pivot_confine_the_search() -> None:
     rows = np.flatnonzero(moves)[::20]
     near = Motion("revolute", AXIS, PIVOT, ANGLE, 0.0)
     values = np.array([ANGLE - 0.05, ANGLE, ANGLE + 0.05])
-    found = scan(
-        a.points[rows], a.colours[rows], AXIS[None], volume, kinds=("revolute",), values=values, near=near, keep=3
-    )
+    found = scan("revolute", a.points[rows], a.colours[rows], AXIS[None], volume, values=values, near=near, keep=3)
     for m in found:
         assert m.kind == "revolute" and m.value in values
         across = m.pivot - PIVOT - AXIS * ((m.pivot - PIVOT) @ AXIS)
@@ -163,7 +161,7 @@ def hand_made(surface_share: float) -> tuple[np.ndarray, np.ndarray, ScoreVolume
 
 def test_going_where_nobody_sees_is_worth_nothing() -> None:
     seeds, colours, volume = hand_made(0.3)
-    found = scan(seeds, colours, np.eye(3)[:1], volume, kinds=("prismatic",), values=np.array([-6.0, 6.0, 2.0]))
+    found = scan("prismatic", seeds, colours, np.eye(3)[:1], volume, values=np.array([-6.0, 6.0, 2.0]))
     assert [m.value for m in found] == [-6, 6, 2]
     seen, hidden, free = (m.score for m in found)
     assert hidden == 0 and free == pytest.approx(-1)
@@ -176,7 +174,7 @@ def test_a_constant_change_of_light_costs_less_than_a_changed_pattern() -> None:
     pattern = colours + 0.3 * np.sign(np.sin(7 * np.arange(100)))[:, None]
 
     def score(c: np.ndarray) -> float:
-        return scan(seeds, c, np.eye(3)[:1], volume, kinds=("prismatic",), values=np.array([-6.0]))[0].score
+        return scan("prismatic", seeds, c, np.eye(3)[:1], volume, values=np.array([-6.0]))[0].score
 
     assert score(colours) == pytest.approx(1, abs=1e-5)
     assert 1 > score(colours + 0.3) > 1.5 * score(pattern)
@@ -184,7 +182,7 @@ def test_a_constant_change_of_light_costs_less_than_a_changed_pattern() -> None:
 
 def test_leaving_the_volume_is_like_free_space() -> None:
     seeds, colours, volume = hand_made(1.0)
-    (out,) = scan(seeds, colours, np.eye(3)[:1], volume, kinds=("prismatic",), values=np.array([100.0]))
+    (out,) = scan("prismatic", seeds, colours, np.eye(3)[:1], volume, values=np.array([100.0]))
     assert out.score == pytest.approx(-1)
 
 

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
@@ -21,7 +20,7 @@ PATCH = 60
 """Seeds of a large piece for each patch that may be a part of its own."""
 HANGING = 0.02
 """Mean error of the best joint on the base, as a fraction of the extent, from which a part may hang on another."""
-PROMISING = 0.6
+WORTH = 0.6
 """A hypothesis is worth as much as it explains its seeds better than this."""
 
 
@@ -108,7 +107,7 @@ def propose(evidence: Evidence, seeds: Sequence[np.ndarray], after: np.ndarray =
         # Slides get a hearing of their own: with three numbers fewer they are seldom the luckiest fit.
         for kind in ("revolute", "prismatic"):
             then = after if s == 0 else np.linalg.inv(after)
-            found = scan(p, e.blurred[s][chosen], directions, e.coarse[1 - s], kinds=(kind,), after=then, keep=4)
+            found = scan(kind, p, e.blurred[s][chosen], directions, e.coarse[1 - s], after=then, keep=4)
             for motion in found:
                 if motion.score > max(0.1, 0.7 * found[0].score):
                     # Compare hypotheses at their best: on the grid a true one may be 3° off and lose to a lucky one.
@@ -167,7 +166,7 @@ def distinct(motions: Sequence[Motion], costs: np.ndarray, points: np.ndarray, a
     ``costs`` (seeds, motions). A seed counts less with every hypothesis that explains it. Two hypotheses are one if
     they take ``points`` (n, 3) to places that lie within ``apart`` on average.
     """
-    gain = np.maximum(PROMISING - costs, 0)
+    gain = np.maximum(WORTH - costs, 0)
     ends = np.stack([moved(points, m.T) for m in motions])
     left = np.ones(len(motions), bool)
     weight = np.ones(len(costs))
@@ -175,7 +174,7 @@ def distinct(motions: Sequence[Motion], costs: np.ndarray, points: np.ndarray, a
     while left.any() and len(kept) < limit:
         best = int(np.where(left, weight @ gain, -1).argmax())
         kept.append(best)
-        weight *= np.where(gain[:, best] > 0.3 * PROMISING, 0.7, 1.0)
+        weight *= np.where(gain[:, best] > 0.3 * WORTH, 0.7, 1.0)
         left &= np.linalg.norm(ends - ends[best], axis=2).mean(1) > apart
     return kept
 
@@ -194,9 +193,10 @@ def refine_motion(
     values = motion.value + np.linspace(-1, 1, 9) * (
         np.radians(spread_deg) if motion.kind == "revolute" else 2 * volume.voxel
     )
-    told: dict[str, Any] = dict(kinds=(motion.kind,), values=values, near=motion, after=motion.after, keep=1)
-    (straight,) = scan(points, colours, motion.axis[None], volume, **told)
-    (best,) = scan(points, colours, tilted, volume, **told)
+    straight, best = (
+        scan(motion.kind, points, colours, axes, volume, values=values, near=motion, after=motion.after, keep=1)[0]
+        for axes in (motion.axis[None], tilted)
+    )
     # The volume is coarse: an axis is tilted only for a clear gain, and the photographs settle the rest later.
     return best if best.score > straight.score + 0.02 else straight
 

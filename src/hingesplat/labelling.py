@@ -24,7 +24,7 @@ HIDDEN_SEED_COST = 0.4
 NOBODY = 0.3
 """What a point without a partner in the other state hears from it, between a partner that disagrees (0) and one that
 agrees (1)."""
-PROMISING, EXCHANGED, PAIRED = 10, 6, 4
+ADDED, EXCHANGED, PAIRED = 10, 6, 4
 """Motions that each round of a choice tries to add, to exchange for one that is there, and to combine in exchange."""
 
 
@@ -206,7 +206,7 @@ def shortest(
         """Sets beside ``kept``, the few first: what is many has its turn when nothing else helps."""
         others = [k for k in promising(kept) if k not in kept]
         smaller = [kept - {k} for k in sorted(kept)]
-        yield smaller + [kept | {k} for k in others[:PROMISING]]
+        yield smaller + [kept | {k} for k in others[:ADDED]]
         yield [less | {k} for less in smaller for k in others[:EXCHANGED]]
         instead = [[k for k in promising(less) if k not in kept][:PAIRED] for less in smaller]
         yield [less | set(pair) for less, ks in zip(smaller, instead, strict=True) for pair in combinations(ks, 2)]

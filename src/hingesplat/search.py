@@ -22,7 +22,7 @@ from hingesplat.visibility import FREE, SURFACE, Sight, ask
 COLOUR_SCALE = 0.2
 """RGB difference at which a surface of another colour counts half."""
 
-PROMISING = 0.6
+CLOSER_LOOK = 0.6
 """A coarse score that is this fraction of the best is worth a finer look."""
 
 BASE = np.eye(4)
@@ -43,6 +43,21 @@ class ScoreVolume:
     """(x, y, z) float32 in [-1, 1]."""
     colour: np.ndarray
     """(x, y, z, 3) float32."""
+
+    @property
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Centres (3,) of the first and the last voxel."""
+        return self.origin, self.origin + (np.array(self.score.shape) - 1) * self.voxel
+
+    @property
+    def reach(self) -> float:
+        """Half of its diagonal."""
+        return float(np.linalg.norm(self.box[1] - self.box[0])) / 2
+
+    @property
+    def grid(self) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
+        """As the kernels take it."""
+        return self.origin.astype(np.float32), self.voxel, self.score, self.colour
 
 
 def score_volume(
@@ -279,22 +294,22 @@ def carrier_of(motion: Motion, motions: Sequence[Motion]) -> int | None:
 
 
 def scan(
+    kind: str,
     seeds: np.ndarray,
     colours: np.ndarray,
     directions: np.ndarray,
     volume: ScoreVolume,
     *,
-    kinds: tuple[str, ...] = ("revolute", "prismatic"),
     values: np.ndarray | None = None,
     near: Motion | None = None,
     after: np.ndarray = BASE,
     keep: int = 12,
 ) -> list[Motion]:
-    """The best distinct motions of seeds (m, 3) with colours (m, 3), each about one of ``directions`` (d, 3).
+    """The best distinct motions of one kind for seeds (m, 3) with colours (m, 3), about or along ``directions`` (d, 3).
 
     Args:
-        values: angles (radians) or slides (scene units) to try, of the one kind in ``kinds``; None tries ±5° to ±150°
-            and every slide that stays within the object.
+        values: angles (radians) or slides (scene units) to try; None tries ±5° to ±150° and every slide that stays
+            within the object.
         near: keep a revolute axis within four voxels of this motion's pivot.
         after: (4, 4) what moves the seeds on, once their joint has moved them.
 
@@ -303,43 +318,11 @@ def scan(
     R, back = after[:3, :3], np.linalg.inv(after)
     seeds, directions = moved(seeds, after), directions @ R.T  # There the same joint stands elsewhere.
     directions = np.ascontiguousarray(directions, dtype=np.float64)
-    grid = (volume.origin.astype(np.float32), volume.voxel, volume.score, volume.colour)
-    seeds32, colours32 = seeds.astype(np.float32), colours.astype(np.float32)
-    low, high = volume.origin, volume.origin + (np.array(volume.score.shape) - 1) * volume.voxel
-    reach = float(np.linalg.norm(high - low)) / 2
-    centroid, threads = seeds.mean(0), torch.get_num_threads()
-    found: list[Motion] = []
-    if "revolute" in kinds:
-        angles = values if values is not None else both_signs(np.radians(np.arange(5, 151, 5)))
-        angles = angles[np.abs(angles) > 1e-3]
-        box = (low, high)
-        if near is not None:
-            pivot = moved(near.pivot[None], after)[0]
-            box = (pivot - 4 * volume.voxel, pivot + 4 * volume.voxel)
-        score = np.full((len(directions), len(angles)), -1, np.float32)
-        pivots = np.zeros((*score.shape, 3))
-        wanted = np.ones(score.shape, bool)
-        # Every second place first, since surfaces are three voxels thick; every place where that is promising.
-        for stride in (2, 1):
-            parallel(
-                _scan_revolute, threads, seeds32, colours32, directions, angles, *grid, *box, reach, stride, wanted,
-                score, pivots,
-            )  # fmt: skip
-            wanted = score > PROMISING * score.max(initial=0)
-        found += [
-            Motion("revolute", directions[i], pivots[i, j], float(angles[j]), float(score[i, j]))
-            for i, j in np.ndindex(score.shape)
-        ]
-    if "prismatic" in kinds:
-        slides = (
-            values if values is not None else both_signs(np.arange(1, 1.2 * reach / volume.voxel, 0.5) * volume.voxel)
-        )
-        score = np.full((len(directions), len(slides)), -1, np.float32)
-        parallel(_scan_prismatic, threads, seeds32, colours32, directions, slides, *grid, score)
-        found += [
-            Motion("prismatic", directions[i], centroid, float(slides[j]), float(score[i, j]))
-            for i, j in np.ndindex(score.shape)
-        ]
+    found = (
+        _turns(seeds, colours, directions, volume, values, None if near is None else moved(near.pivot[None], after)[0])
+        if kind == "revolute"
+        else _slides(seeds, colours, directions, volume, values)
+    )
     found.sort(key=lambda m: -m.score)
     kept: list[Motion] = []
     ends: list[np.ndarray] = []
@@ -351,6 +334,49 @@ def scan(
             if len(kept) == keep:
                 break
     return [replace(m, axis=m.axis @ R, pivot=moved(m.pivot[None], back)[0], after=after) for m in kept]
+
+
+def _turns(
+    seeds: np.ndarray,
+    colours: np.ndarray,
+    directions: np.ndarray,
+    volume: ScoreVolume,
+    angles: np.ndarray | None,
+    pivot: np.ndarray | None,
+) -> list[Motion]:
+    """For each direction and angle the place of the axis that scores best."""
+    angles = both_signs(np.radians(np.arange(5, 151, 5))) if angles is None else angles
+    angles = angles[np.abs(angles) > 1e-3]
+    box = volume.box if pivot is None else (pivot - 4 * volume.voxel, pivot + 4 * volume.voxel)
+    score = np.full((len(directions), len(angles)), -1, np.float32)
+    pivots = np.zeros((*score.shape, 3))
+    wanted = np.ones(score.shape, bool)
+    # Every second place first, since surfaces are three voxels thick; every place where that is promising.
+    for stride in (2, 1):
+        parallel(
+            _scan_revolute, torch.get_num_threads(), seeds.astype(np.float32), colours.astype(np.float32), directions,
+            angles, *volume.grid, *box, volume.reach, stride, wanted, score, pivots,
+        )  # fmt: skip
+        wanted = score > CLOSER_LOOK * score.max(initial=0)
+    return [
+        Motion("revolute", directions[i], pivots[i, j], float(angles[j]), float(score[i, j]))
+        for i, j in np.ndindex(score.shape)
+    ]
+
+
+def _slides(
+    seeds: np.ndarray, colours: np.ndarray, directions: np.ndarray, volume: ScoreVolume, slides: np.ndarray | None
+) -> list[Motion]:
+    if slides is None:
+        slides = both_signs(np.arange(1, 1.2 * volume.reach / volume.voxel, 0.5) * volume.voxel)
+    score = np.full((len(directions), len(slides)), -1, np.float32)
+    given = (seeds.astype(np.float32), colours.astype(np.float32), directions, slides, *volume.grid)
+    parallel(_scan_prismatic, torch.get_num_threads(), *given, score)
+    centroid = seeds.mean(0)
+    return [
+        Motion("prismatic", directions[i], centroid, float(slides[j]), float(score[i, j]))
+        for i, j in np.ndindex(score.shape)
+    ]
 
 
 def both_signs(values: np.ndarray) -> np.ndarray:

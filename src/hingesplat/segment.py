@@ -242,11 +242,11 @@ def track(
         mine = here.rows(rng.choice(own, min(2 * config.hypotheses.seeds_per_search, len(own)), replace=False))
         reach = np.radians(150) if motion.kind == "revolute" else extent / 2
         trials = scan(
+            motion.kind,
             mine.points,
             mine.colours,
             motion.axis[None],
             volume,
-            kinds=(motion.kind,),
             values=np.linspace(-reach, reach, 201),
             near=motion,
             after=after,
