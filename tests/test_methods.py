@@ -10,7 +10,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from hingesplat import cli, pipeline
+from hingesplat import cli, pipeline, run_folder
 from hingesplat.capture import Capture
 from hingesplat.capture.types import State
 from hingesplat.errors import HingesplatError
@@ -129,7 +129,7 @@ def run(tmp_path: Path) -> Run:
     MADE.at(1).save(tmp_path / "fit_state1.safetensors")
     for t, state in enumerate(CAPTURE.states):  # Nothing is known of depth.
         unknown = {str(i): torch.zeros(view.rgba.shape[:2]) for i, view in enumerate(state.train)}
-        pipeline.write_tensors(tmp_path / f"depth_state{t}.safetensors", unknown)
+        run_folder.write_tensors(tmp_path / f"depth_state{t}.safetensors", unknown)
     return Run(tmp_path, CAPTURE, ReconstructConfig(), lambda **_: None)
 
 
@@ -223,7 +223,7 @@ def test_other_photographs_share_nothing(stages: Stages, tmp_path: Path) -> None
 
 
 def test_every_inherited_option_is_one() -> None:
-    known = pipeline._flat(asdict(ReconstructConfig())) | {"photographs": ""}
+    known = run_folder.flat(asdict(ReconstructConfig())) | {"photographs": ""}
     for options, _ in pipeline.INHERITED.values():
         for option in options:
             assert any(k == option or k.startswith(f"{option}.") for k in known), option

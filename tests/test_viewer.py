@@ -182,7 +182,7 @@ def test_a_photograph_sets_the_state_and_stands_beside_its_render(run: Path, mad
 def test_repel_points_are_shown_where_the_run_had_some(run: Path) -> None:
     (run / "config.json").write_text(json.dumps({"articulate": {"repel": {"points": 50}}}))
     blocks().save(run / "canonical.safetensors")
-    from hingesplat.pipeline import repel_points_of
+    from hingesplat.run_folder import repel_points_of
 
     points = repel_points_of(run)
     assert points.shape == (50, 3) and (np.abs(points) < 0.31).all()

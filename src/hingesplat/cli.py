@@ -114,7 +114,7 @@ class Render:
     """Say nothing but warnings and errors."""
 
     def run(self, console: Console) -> None:
-        from hingesplat.pipeline import load_result, up_of
+        from hingesplat.run_folder import load_result, up_of
         from hingesplat.video import write_video
 
         gaussians, twin = load_result(self.run_folder)
@@ -166,7 +166,7 @@ class Export:
 
     def run(self, console: Console) -> None:
         from hingesplat.export.check import check_export
-        from hingesplat.pipeline import load_meshes, load_result
+        from hingesplat.run_folder import load_meshes, load_result
 
         gaussians, twin = load_result(self.run_folder)
         meshes = load_meshes(self.run_folder, twin)

@@ -4,7 +4,6 @@ Every stage reads what those before it wrote into the run folder and writes its 
 goes on where it was. ``stages.json`` says which stages are finished; files are written whole or not at all.
 """
 
-import json
 import logging
 import platform
 import shutil
@@ -13,37 +12,43 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from hashlib import blake2b
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from threading import Event, Lock
 from typing import Any, Literal
 
 import numpy as np
 import torch
-import trimesh
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor
 
 from hingesplat.articulate import ArticulateConfig, Articulation, articulate
 from hingesplat.camera import common_up
-from hingesplat.capture import Capture, View, load_cameras
+from hingesplat.capture import Capture, View
 from hingesplat.capture.images import downsampled
 from hingesplat.errors import HingesplatError
 from hingesplat.export import export_twin
 from hingesplat.export.splats import write_ply
-from hingesplat.files import whole_file, whole_folder, write_json
+from hingesplat.files import whole_folder, write_json
 from hingesplat.fit import FitConfig, fit
 from hingesplat.fuse import FuseConfig, fuse
 from hingesplat.gaussians import Gaussians, posed
 from hingesplat.joints import JointsConfig, find_joints
 from hingesplat.mesh import MeshConfig, mesh_parts
-from hingesplat.physics import RepelConfig, draw_repel_points
 from hingesplat.pictures import movable_share, write_motion_gif, write_summary
 from hingesplat.report import spread_views, write_report, write_views
+from hingesplat.run_folder import (
+    load_meshes,
+    load_result,
+    log_file,
+    open_folder,
+    read_json,
+    take_over,
+    versions,
+    write_tensors,
+)
 from hingesplat.search import Motion
 from hingesplat.segment import Segmentation, SegmentConfig, segment, track
 from hingesplat.slots import living_slots
@@ -65,12 +70,6 @@ NOISE = 10
 """Seeds, in those of the smallest part, below which nothing need have moved: one state photographed twice had 167."""
 SHOWN_VIEWS = 3
 """Photographs of each state that the report shows beside the twin."""
-ARTEFACTS = (
-    *("config.json", "stages.json", "log.txt", "depth_state*.safetensors", "fit_state*.safetensors", "segmentation.*"),
-    *("canonical.safetensors", "articulation.safetensors", "gaussians*.safetensors", "twin.json"),
-    *("parts", "export", "curves.json", "views", "motion.gif", "summary.*", "metrics.json", "report.html", "*.tmp"),
-)
-"""Everything that a run folder holds; ``overwrite`` deletes these and nothing else."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +136,7 @@ class Curves:
 
     def __init__(self, path: Path, report: Report) -> None:
         self.path, self.pass_on = path, report
-        self.series: dict[str, dict[str, list[float]]] = _read_json(path) if path.is_file() else {}
+        self.series: dict[str, dict[str, list[float]]] = read_json(path) if path.is_file() else {}
 
     def report(self, *, stage: str, state: int | None = None, **numbers: Any) -> None:
         """Pass on, and take down every step that goes further than the last."""
@@ -204,19 +203,19 @@ def reconstruct(
         The twin; the paths in it are relative to ``out``.
 
     Raises:
-        HingesplatError: ``out`` belongs to another capture, config or program; the config makes no sense; or
+        HingesplatError: ``out`` belongs to another capture or config; the config makes no sense; or
             no rigid parts explain the motion.
     """
     config = config or ReconstructConfig()
     _check(config)
     capture = _capped(capture, config.max_size)
     folder = Path(tempfile.mkdtemp(prefix="hingesplat-")) if out is None else Path(out)
-    _open(folder, capture, config, overwrite)
-    _take_over(folder, parents)
+    open_folder(folder, capture, config, overwrite)
+    take_over(folder, parents, INHERITED)
     curves = Curves(folder / "curves.json", report)
     run = Run(folder, capture, config, curves.report)
     try:
-        with _log_file(folder / "log.txt"), _repeatable():
+        with log_file(folder / "log.txt"), _repeatable():
             log.info("%s to %s", capture.path, folder)
             _run_stages(run, curves)
     finally:
@@ -226,7 +225,7 @@ def reconstruct(
 
 
 def _run_stages(run: Run, curves: Curves) -> None:
-    finished = _read_json(run / "stages.json") if (run / "stages.json").is_file() else {}
+    finished = read_json(run / "stages.json") if (run / "stages.json").is_file() else {}
     for name, stage in STAGES.items():
         if name in finished:
             log.info("%s: done before", name)
@@ -380,7 +379,7 @@ def _articulate(run: Run) -> None:
     fitted = [_fitted(run, t) for t in range(len(T_state_0))]
     if len(T_1_0) > 1:
         labels = load_file(run / "segmentation.safetensors")["labels_0"].numpy()
-        motions = [Motion.of(m) for m in _read_json(run / "segmentation.json")["motions"]]
+        motions = [Motion.of(m) for m in read_json(run / "segmentation.json")["motions"]]
         # A start without motions leaves the states between to the optimisation.
         for t in range(1, len(T_state_0) - 1 if motions else 1):
             pair, views = (fitted[0], fitted[t]), (run.views[0], run.views[t])
@@ -545,66 +544,6 @@ def telling_view(gaussians: Gaussians, views: Sequence[View]) -> View:
     return max(views, key=lambda view: movable_share(gaussians, view.camera))
 
 
-def load_result(folder: Path) -> tuple[Gaussians, Twin]:
-    """The Gaussians, frame of state 0, and the twin of a run.
-
-    Raises:
-        HingesplatError: no such run, one that has not come this far, or something broken.
-    """
-    if not folder.is_dir():
-        raise HingesplatError(f"{folder}: no such run folder")
-    if (folder / "stages.json").is_file() and not (folder / "twin.json").is_file():
-        raise HingesplatError(f"{folder}: its run is not finished; give the same `hingesplat reconstruct` again")
-    twin = Twin.load(folder / "twin.json")
-    return Gaussians.load(folder / "gaussians.safetensors"), twin
-
-
-def capture_of(folder: Path) -> Path | None:
-    """The capture that a run was made from; None where it is gone."""
-    known = _config_of(folder).get("capture")
-    return Path(known) if isinstance(known, str) and Path(known).is_dir() else None
-
-
-def up_of(folder: Path) -> np.ndarray | None:
-    """Up (3,) as the photographs of a run have it; None where these are gone."""
-    capture = capture_of(folder)
-    with suppress(HingesplatError):
-        return None if capture is None else common_up(load_cameras(capture))
-
-
-def repel_points_of(folder: Path) -> np.ndarray:
-    """Repel points (n, 3) as ``articulate`` draws them, where a run used them; else none."""
-    told, path = _config_of(folder).get("articulate", {}).get("repel"), folder / "canonical.safetensors"
-    drawn = None
-    if isinstance(told, dict) and path.is_file():
-        drawn = draw_repel_points(Gaussians.load(path), RepelConfig(**told), torch.Generator().manual_seed(0))
-    return np.zeros((0, 3), np.float32) if drawn is None else drawn.numpy()
-
-
-def _config_of(folder: Path) -> dict[str, Any]:
-    path = folder / "config.json"
-    return _read_json(path) if path.is_file() else {}
-
-
-def load_meshes(folder: Path, twin: Twin) -> dict[int, trimesh.Trimesh]:
-    """The part meshes of a run, by part id, frame of state 0.
-
-    Raises:
-        HingesplatError: a mesh file is missing or broken.
-    """
-    meshes = {}
-    for part in twin.parts:
-        if part.mesh is not None:
-            path = folder / part.mesh
-            try:
-                mesh = trimesh.load(path, force="mesh", process=False)
-            except Exception as e:  # Readers of many formats raise errors of many kinds.
-                raise HingesplatError(f"{path}: missing or no readable mesh; reconstruct again") from e
-            assert isinstance(mesh, trimesh.Trimesh)
-            meshes[part.id] = mesh
-    return meshes
-
-
 def _capped(capture: Capture, max_size: int | None) -> Capture:
     """The capture with its photographs at most ``max_size`` pixels long."""
     if max_size is None:
@@ -615,101 +554,6 @@ def _capped(capture: Capture, max_size: int | None) -> Capture:
 
     states = (replace(s, train=cap(s.train), test=cap(s.test)) for s in capture.states)
     return replace(capture, states=tuple(states))
-
-
-# The run folder.
-
-
-def _open(folder: Path, capture: Capture, config: ReconstructConfig, overwrite: bool) -> None:
-    """Make the folder ready: new, or that of the same run, or cleared of another."""
-    path = folder / "config.json"
-    identity = {
-        **json.loads(json.dumps(asdict(config))),
-        "capture": str(capture.path.resolve()),
-        "photographs": fingerprint(capture),
-    }
-    if path.is_file():
-        known = _read_json(path)
-        if "photographs" not in known:
-            raise HingesplatError(f"{folder}: its config.json is not that of a run; give another folder")
-        if not overwrite:
-            _check_same_run(folder, known, identity)
-            return
-        for pattern in ARTEFACTS:
-            for old in folder.glob(pattern):
-                shutil.rmtree(old) if old.is_dir() else old.unlink()
-    elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise HingesplatError(f"{folder}: is in use and holds no run; give another folder")
-    folder.mkdir(parents=True, exist_ok=True)
-    write_json(path, identity | {"versions": versions()})
-
-
-def _check_same_run(folder: Path, known: dict[str, Any], wanted: dict[str, Any]) -> None:
-    remedy = "give another folder, or --overwrite to start afresh"
-    if known["capture"] != wanted["capture"]:
-        raise HingesplatError(f"{folder}: belongs to another capture ({known['capture']}); {remedy}")
-    old, new = _flat(known), _flat(wanted)
-    changed = [k for k in new if k != "photographs" and old.get(k) != new[k]]
-    if changed:
-        k = changed[0]
-        more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
-        raise HingesplatError(
-            f"{folder}: was made with another config ({k} was {old.get(k)}, is {new[k]}{more}); {remedy}"
-        )
-    if known["photographs"] != wanted["photographs"]:
-        raise HingesplatError(
-            f"{folder}: belongs to another capture (the photographs in {known['capture']} have changed); {remedy}"
-        )
-
-
-def _take_over(folder: Path, parents: Sequence[Path]) -> None:
-    """Copy the first stages' results from the run that agrees with this one the longest."""
-    wanted = _flat(_config_of(folder))
-    shared = {parent: _stages_shared(parent, wanted) for parent in parents}
-    best = max(shared, key=lambda parent: len(shared[parent]), default=None)
-    if best is None or not shared[best] or (folder / "stages.json").is_file():
-        return
-    for name in shared[best]:
-        for path in best.glob(INHERITED[name][1]):
-            shutil.copy2(path, folder / path.name)
-    if (best / "curves.json").is_file():
-        shutil.copy2(best / "curves.json", folder / "curves.json")
-    finished = _read_json(best / "stages.json")
-    write_json(folder / "stages.json", {name: finished[name] for name in shared[best]})
-
-
-def _stages_shared(parent: Path, wanted: dict[str, Any]) -> list[str]:
-    """The first stages of a run that the same photographs and options would make again."""
-    known = _flat(_config_of(parent))
-    finished = _read_json(parent / "stages.json") if (parent / "stages.json").is_file() else {}
-    shared = []
-    for name, (options, _) in INHERITED.items():
-        keys = [k for k in wanted if any(k == o or k.startswith(f"{o}.") for o in options)]
-        if name not in finished or any(k not in known or known[k] != wanted[k] for k in keys):
-            break
-        shared.append(name)
-    return shared
-
-
-def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested keys joined by dots."""
-    flat = {}
-    for key, value in tree.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
-    return flat
-
-
-def fingerprint(capture: Capture) -> str:
-    """A digest of every training pixel, mask and camera: what the twin is made from."""
-    digest = blake2b(digest_size=12)
-    for state in capture.states:
-        for view in state.train:
-            c = view.camera
-            digest.update(np.array([*c.T_world_camera.ravel(), c.fx, c.fy, c.cx, c.cy]).tobytes())
-            digest.update(np.ascontiguousarray(view.rgba).data)
-            digest.update(b"" if view.depth is None else np.ascontiguousarray(view.depth).data)
-        digest.update(b"/")
-    return digest.hexdigest()
 
 
 def _write_summary(run: Run, finished: dict[str, Any]) -> None:
@@ -731,15 +575,6 @@ def _write_summary(run: Run, finished: dict[str, Any]) -> None:
     write_json(run / "summary.json", summary)
 
 
-def versions() -> dict[str, str]:
-    """Of the program and of what its numbers depend on."""
-    found = {"python": platform.python_version()}
-    for name in ("hingesplat", "torch", "numba", "numpy", "scipy", "gsplat"):
-        with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
-
-
 def peak_memory_mb() -> float | None:
     """Most memory this process ever held, MB; None where the system does not tell."""
     try:
@@ -748,22 +583,6 @@ def peak_memory_mb() -> float | None:
         return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)
-
-
-def write_tensors(path: Path, tensors: dict[str, Tensor]) -> None:
-    """Write a safetensors file, whole or not at all."""
-    with whole_file(path) as tmp:
-        save_file({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, str(tmp))
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(path.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as e:
-        raise HingesplatError(f"{path}: not valid JSON; give another folder") from e
-    if not isinstance(data, dict):
-        raise HingesplatError(f"{path}: must hold a JSON object; give another folder")
-    return data
 
 
 @contextmanager
@@ -775,28 +594,3 @@ def _repeatable() -> Iterator[None]:
         yield
     finally:
         torch.use_deterministic_algorithms(before)
-
-
-class _LogFile(logging.FileHandler):
-    """Silent where it cannot write: a full disk is reported by the stage that meets it."""
-
-    def handleError(self, record: logging.LogRecord) -> None:
-        pass
-
-
-@contextmanager
-def _log_file(path: Path) -> Iterator[None]:
-    """What the package logs goes to this file, too."""
-    handler = _LogFile(path, encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s", "%Y-%m-%d %H:%M:%S"))
-    package = logging.getLogger("hingesplat")
-    level = package.level
-    package.addHandler(handler)
-    package.setLevel(logging.INFO)
-    try:
-        yield
-    finally:
-        package.setLevel(level)
-        package.removeHandler(handler)
-        with suppress(OSError):
-            handler.close()

@@ -24,7 +24,7 @@ from hingesplat.capture import Capture, View, load_capture, recognise, visual_hu
 from hingesplat.errors import HingesplatError
 from hingesplat.gaussians import SH_C0, Gaussians, posed
 from hingesplat.pictures import fitted, in_part_colours, movable_share, part_colour, photograph, picture, sweep_values
-from hingesplat.pipeline import capture_of, load_meshes, load_result, repel_points_of
+from hingesplat.run_folder import capture_of, load_meshes, load_result, repel_points_of
 from hingesplat.se3 import wxyz_to_matrix
 from hingesplat.twin import Joint, Twin
 
