@@ -12,7 +12,7 @@ from hingesplat.surface import Labels, Surface, components
 
 LARGE_PIECE = 0.2
 """A piece this large beside the largest of its part is a part of its own, not a fragment."""
-LEAST_SHARE = 0.002
+LEAST_SHARE = 0.001
 """Of each state's surface: a part that shows less of itself in one of them has no way from there to here."""
 SURE = 0.4
 """A fragment that costs so much more with what it touches, on average, stays what it is."""
