@@ -32,12 +32,13 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def perfect_twin(truth: Truth) -> Twin:
     """The truth itself, said as a twin."""
-    joints = tuple(
-        Joint(j.child, j.parent, j.type, tuple(j.axis), tuple(j.pivot), (0.0, j.motion), (0.0, j.motion))
-        for j in truth.joints
-    )
+    joints = []
+    for j in truth.joints:
+        states = (0.0, j.motion)
+        limits = (min(states), max(states))
+        joints.append(Joint(j.child, j.parent, j.type, tuple(j.axis), tuple(j.pivot), states, limits))
     parts = tuple(Part(i, p.name, 0, f"parts/{p.name}.obj") for i, p in enumerate(truth.parts))
-    return Twin(parts, joints)
+    return Twin(parts, tuple(joints))
 
 
 def write_run(run: Path, truth: Truth, twin: Twin) -> Path:
