@@ -268,24 +268,24 @@ def test_the_force_is_the_printed_sum_turned_round(g: torch.Generator) -> None:
     mu, r = randn(g, N, 3), randn(g, 30, 3)
     offset = r[None] - mu[:, None]
     printed = (5e-4 * offset / offset.norm(dim=-1, keepdim=True) ** 3).sum(1)
-    torch.testing.assert_close(repel_force(mu, r, tau_max=1e9, nearest=None), -printed)
-    torch.testing.assert_close(repel_force(mu, r, tau_max=1e9, nearest=30), -printed)
+    torch.testing.assert_close(repel_force(mu, r, tau_max=1e9, neighbours=None), -printed)
+    torch.testing.assert_close(repel_force(mu, r, tau_max=1e9, neighbours=30), -printed)
 
 
 def test_the_force_turns_with_the_frame_and_the_nearest_points_carry_it(g: torch.Generator) -> None:
     r = sample_repel_points(sphere(g, 800), sphere(g, 800), N_R=500, generator=g)
     mu = sphere(g, 40, 1.01)
     A = rigid(g)
-    near, whole = repel_force(mu, r, tau_max=1e9), repel_force(mu, r, tau_max=1e9, nearest=None)
+    near, whole = repel_force(mu, r, tau_max=1e9), repel_force(mu, r, tau_max=1e9, neighbours=None)
     torch.testing.assert_close(repel_force(se3.apply(A, mu), se3.apply(A, r), tau_max=1e9), near @ A[:3, :3].T)
     assert torch.cosine_similarity(near, whole).median() > 0.7
 
 
-@pytest.mark.parametrize("nearest", [None, 4])
+@pytest.mark.parametrize("neighbours", [None, 4])
 @pytest.mark.parametrize("tau_max", [1e9, 1e-3])
-def test_gradients_of_the_force(g: torch.Generator, nearest: int | None, tau_max: float) -> None:
+def test_gradients_of_the_force(g: torch.Generator, neighbours: int | None, tau_max: float) -> None:
     mu, r = leaf(randn(g, N, 3)), leaf(randn(g, 9, 3))
-    assert gradcheck(lambda a, b: repel_force(a, b, tau_max=tau_max, nearest=nearest), (mu, r))
+    assert gradcheck(lambda a, b: repel_force(a, b, tau_max=tau_max, neighbours=neighbours), (mu, r))
 
 
 def test_the_force_has_finite_gradients_on_top_of_a_repel_point() -> None:

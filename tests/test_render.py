@@ -11,8 +11,8 @@ from hingesplat.camera import Camera
 from hingesplat.errors import HingesplatError
 from hingesplat.gaussians import Gaussians
 from hingesplat.render import gsplat_backend, rasterize, render, sh_to_rgb
-from hingesplat.render.torch_backend import BLUR, NEAR
 from hingesplat.simd import LANES
+from standin import definition_as_gsplat
 
 BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
 NAMES = ("means", "quats", "scales", "opacities", "colors", "channels")
@@ -264,28 +264,6 @@ def test_screen_gradient_statistics(channels):
 
     slope = math.hypot(loss(h, 0) - loss(-h, 0), loss(0, h) - loss(0, -h)) / (2 * h)
     assert statistics[0, 0].item() == pytest.approx(slope, rel=1e-3)
-
-
-def definition_as_gsplat(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **options):
-    """What stands in for gsplat's call where there is no GPU: its arguments and returns, drawn by the definition."""
-    assert options == {"near_plane": NEAR, "eps2d": BLUR, "packed": False, "render_mode": "RGB+D"}
-    T, K = viewmats[0].double(), Ks[0]
-    pose = torch.linalg.inv(T).numpy()
-    view = Camera(pose, *(float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))), width, height)
-    # By way of the projected means, so that these get a gradient.
-    R, t = T[:3, :3].to(means), T[:3, 3].to(means)
-    x, y, z = (means @ R.T + t).unbind(1)
-    means2d = torch.stack([view.fx * x / z + view.cx, view.fy * y / z + view.cy], 1)[None]
-    u, v = means2d[0].unbind(1)
-    centres = torch.stack([(u - view.cx) / view.fx * z, (v - view.cy) / view.fy * z, z], 1)
-    geometry = ((centres - t) @ R, quats, scales, opacities)
-    r = rasterize(*geometry, colors[:, :3], view, channels=colors[:, 3:], backend="torch")
-    statistics = torch.zeros((len(means), 3), dtype=means.dtype)
-    alone = [a.detach().requires_grad_() for a in (*geometry, colors[:, :3])]
-    rasterize(*alone, view, backend="torch", screen_gradient=statistics).rgb.sum().backward()
-    radii = statistics[:, 2:].expand(-1, 2)[None]
-    image = torch.cat([r.rgb, r.channels, r.depth[None]]).permute(1, 2, 0)
-    return image[None], r.alpha[None, :, :, None], {"means2d": means2d, "radii": radii}
 
 
 @pytest.mark.parametrize("channels", [0, 5])

@@ -86,6 +86,7 @@ def articulate(
     fitted: Sequence[Gaussians] = (),
     maps: Sequence[Sequence[DepthMap]] = (),
     seed: int = 0,
+    device: torch.device | str = "cpu",
     report: Report = lambda **_: None,
 ) -> Articulation:
     """Optimise everything together, starting from the parts and motions given.
@@ -98,27 +99,28 @@ def articulate(
         views: training photographs of every state.
         fitted: each state's own Gaussians; L_art, L_vector and displacements without parts need them.
         maps: the depth of every photograph where it is known.
+        device: where to optimise; what comes out is on the CPU.
     """
     rng = np.random.default_rng(seed)
     generator = torch.Generator().manual_seed(seed)
     low, high = np.quantile(canonical.means.numpy(), [0.002, 0.998], axis=0)
     extent = float((high - low).max())
-    parts = T_state_0.shape[1]
+    canonical, parts = canonical.to(device), T_state_0.shape[1]
     centres = part_centres(canonical, parts)
     first = config.frame == "first"
-    poses = PoseDelta(torch.from_numpy(T_state_0).float(), centres, extent, first_is_frame=first)
+    poses = PoseDelta(torch.from_numpy(T_state_0).to(canonical.means), centres, extent, first_is_frame=first)
     pose_adam = torch.optim.Adam(poses.parameters, lr=config.pose_rate)
     rate = config.rates.means * extent
     identity = identity_of(canonical, parts, fitted, config.identity, extent, rate, generator)
     targets = Targets(canonical, fitted, config.physics, extent, seed)
     repulsion = Repulsion(config.repel, extent, generator)
-    extra = {"state_sh": (torch.zeros((len(canonical), len(views) - 1, 3)), config.rates.sh)}
+    extra = {"state_sh": (canonical.means.new_zeros((len(canonical), len(views) - 1, 3)), config.rates.sh)}
     optimiser = GaussianAdam(canonical, config.rates, extent, extra | identity.extra | targets.extra)
-    training = training_views(views, maps)
+    training = training_views(views, maps, device)
     if first and config.identity.kind == "hard" and config.align_steps:
         _align(canonical, poses, training, fitted, extent, config, rng)
     photographs = shuffled(training, rng)
-    statistics = torch.zeros((len(optimiser), 3))
+    statistics = optimiser.fresh_statistics()
     tell = averaged(report, config.steps)
     for step in range(config.steps):
         progress = step / config.steps
@@ -140,7 +142,7 @@ def articulate(
         pose_step(pose_adam, config.pose_rate, progress)
         if step % config.densify_every == config.densify_every - 1 and progress < 0.7:
             grow(optimiser, statistics, config.max_gaussians, config.min_opacity, extent, generator)
-            statistics = torch.zeros((len(optimiser), 3))
+            statistics = optimiser.fresh_statistics()
             identity.stale()
             targets.stale()
         tell(loss, error, len(optimiser))
@@ -170,7 +172,7 @@ def _align(
     good = (after < BETTER * before) | ((after < before) & still_on)
     with torch.no_grad():
         for correction in poses.parameters:
-            correction[:, 1:][:, torch.from_numpy(~good)] = 0
+            correction[:, 1:] *= torch.from_numpy(good).to(correction)[:, None]
 
 
 def _mean_errors(g: Gaussians, poses: PoseDelta, training: Sequence[Sequence[TrainingView]]) -> np.ndarray:
@@ -186,7 +188,7 @@ def _misfits(g: Gaussians, poses: PoseDelta, fitted: Sequence[Gaussians], extent
 
     Zero where a part has none. Infinite if no state has been fitted.
     """
-    R, t = poses.Rt()
+    g, (R, t) = g.to("cpu"), (x.cpu() for x in poses.Rt())
     total = np.zeros(R.shape[1] - 1) if fitted else np.full(R.shape[1] - 1, np.inf)
     g = g[g.opacities > 0.5]
     for state, own in list(enumerate(fitted))[1:]:
@@ -207,14 +209,14 @@ def _result(
     config: ArticulateConfig,
     seed: int,
 ) -> Articulation:
-    g = optimiser.gaussians.detached()
+    g = optimiser.gaussians.detached().to("cpu")
     with torch.no_grad():
-        R, t = poses.Rt()
+        R, t = (x.cpu() for x in poses.Rt())
     T = np.tile(np.eye(4), (*R.shape[:2], 1, 1))
     u, _, vt = np.linalg.svd(R.double().numpy())
     T[..., :3, :3], T[..., :3, 3] = u @ vt, t.double().numpy()
     if isinstance(identity, Free):
-        part, T = parts_of_shifts(g.means, optimiser.values["shift"].detach(), T.shape[1], seed)
+        part, T = parts_of_shifts(g.means, optimiser.values["shift"].detach().cpu(), T.shape[1], seed)
         g = g.with_part(part)
     if config.identity.kind != "hard":
         label, living = living_slots(g.means.numpy(), g.part.numpy(), T, extent, config.slots)
@@ -223,7 +225,7 @@ def _result(
         posed(g, dict(enumerate(T[0]))),
         T @ np.linalg.inv(T[:1]),
     )  # To state 0, where they are already if it is the frame.
-    offsets = optimiser.values["state_sh"].detach().permute(1, 0, 2)
+    offsets = optimiser.values["state_sh"].detach().cpu().permute(1, 0, 2)
     state_sh = torch.cat([torch.zeros_like(offsets[:1]), offsets])
     return Articulation(g, T, state_sh.clone())
 

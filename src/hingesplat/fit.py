@@ -120,6 +120,7 @@ def fit(
     seed: int = 0,
     maps: Sequence[DepthMap] = (),
     cloud: Cloud | None = None,
+    device: torch.device | str = "cpu",
     report: Report = lambda **_: None,
 ) -> Gaussians:
     """Photographs of one state to Gaussians on its surface.
@@ -128,25 +129,26 @@ def fit(
         views: posed photographs with masks.
         maps: their depth where it is known; the start is the visual hull where it is not.
         cloud: start from these points instead of either.
+        device: where to optimise.
         report: called now and then with ``step, steps, loss, psnr, gaussians``.
 
     Returns:
-        Gaussians of the chosen spherical-harmonic degree, all of part 0, each seen from at least one view.
+        Gaussians of the chosen spherical-harmonic degree, all of part 0, each seen from at least one view; on the CPU.
     """
     rng = np.random.default_rng(seed)
     generator = torch.Generator().manual_seed(seed)
     if cloud is None:
         cloud = start_cloud(views, maps, config.start_gaussians, rng)
     extent = float((cloud.points.max(0) - cloud.points.min(0)).max())
-    (training,) = training_views([views], [maps])
+    (training,) = training_views([views], [maps], device)
     held_back = training[:: max(len(training) // 4, 2)][:4] if len(training) >= 12 else []
     kept = [v for v in training if not any(v is h for h in held_back)]
-    start = start_from_cloud(cloud, extent / 64)
+    start = start_from_cloud(cloud, extent / 64).to(device)
     optimiser = GaussianAdam(start[morton_order(start.means)], config.rates, extent)
     _optimise(optimiser, kept, config, extent, rng, generator, report)
     cameras = [v.camera for v in training]
     optimiser.select(seen_weight(optimiser.gaussians.detached(), cameras) > 0.5)
-    return _choose_sh_degree(optimiser, kept, held_back, config, extent, rng, report)
+    return _choose_sh_degree(optimiser, kept, held_back, config, extent, rng, report).to("cpu")
 
 
 def _optimise(
@@ -159,7 +161,7 @@ def _optimise(
     report: Report,
 ) -> None:
     cameras = [v.camera for v in training]
-    statistics = torch.zeros((len(optimiser), 3))
+    statistics = optimiser.fresh_statistics()
     photographs = shuffled([training], rng)
     tell = averaged(report, config.steps)
     for step in range(config.steps):
@@ -171,10 +173,10 @@ def _optimise(
         growing = step >= 200 and progress < config.densify_until
         if growing and step % config.densify_every == 0:
             grow(optimiser, statistics, config.max_gaussians, config.min_opacity, extent, generator)
-            statistics = torch.zeros((len(optimiser), 3))
+            statistics = optimiser.fresh_statistics()
         if growing and step % 500 == 0:
             optimiser.select(seen_weight(optimiser.gaussians.detached(), cameras) > 0.5)
-            statistics = torch.zeros((len(optimiser), 3))
+            statistics = optimiser.fresh_statistics()
         tell(loss, error, len(optimiser))
 
 
@@ -205,7 +207,7 @@ def _choose_sh_degree(
     base = optimiser.gaussians.detached()
     best, best_psnr = base, -math.inf
     for degree in range(config.max_sh_degree + 1) if held_back else [0]:
-        padding = torch.zeros((len(base), (degree + 1) ** 2 - 1, 3))
+        padding = base.sh.new_zeros((len(base), (degree + 1) ** 2 - 1, 3))
         start = replace(base, sh=torch.cat([base.sh, padding], 1))
         trial = GaussianAdam(start, config.rates, extent)
         photographs = shuffled([training], rng)

@@ -63,6 +63,10 @@ class Gaussians:
         """A copy without gradients, sharing no memory with the original."""
         return Gaussians(**{f.name: getattr(self, f.name).detach().clone() for f in fields(self)})
 
+    def to(self, device: torch.device | str) -> "Gaussians":
+        """The same Gaussians on a device; tensors that are there already are shared."""
+        return Gaussians(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
     def with_part(self, part: Tensor) -> "Gaussians":
         return replace(self, part=part)
 

@@ -10,13 +10,12 @@ from typing import Literal
 import numpy as np
 import torch
 from scipy.cluster.vq import kmeans2
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from hingesplat.gaussians import Gaussians
 from hingesplat.losses.part import nearest_neighbours, part_loss, part_probabilities
 from hingesplat.losses.velocity import fit_parts
-from hingesplat.matching import one_to_one
+from hingesplat.matching import nearest, one_to_one
 from hingesplat.optim import GaussianAdam
 from hingesplat.se3 import wxyz_to_matrix
 
@@ -69,8 +68,8 @@ class Embedding(Identity):
         self.neighbours: Tensor | None = None
         size = max(config.size, parts)
         # Orthogonal codes scaled so that a label that is known starts with a probability of about 0.97.
-        self.weight = torch.eye(parts, size) * (np.log(32.0 * parts) ** 0.5)
-        psi = 0.01 * torch.randn((len(g), size), generator=generator)
+        self.weight = torch.eye(parts, size, device=g.means.device) * (np.log(32.0 * parts) ** 0.5)
+        psi = 0.01 * torch.randn((len(g), size), generator=generator).to(g.means)
         if (g.part > 0).any():
             psi = psi + self.weight[g.part]
         self.extra = {"psi": (psi, config.rate)}
@@ -78,7 +77,7 @@ class Embedding(Identity):
     def probabilities(self, optimiser: GaussianAdam, progress: float) -> Tensor | None:
         if progress >= self.config.hard_from:
             return None
-        p = part_probabilities(optimiser.values["psi"], self.weight, torch.zeros(len(self.weight)))
+        p = part_probabilities(optimiser.values["psi"], self.weight, torch.zeros_like(self.weight[:, 0]))
         optimiser.part = p.detach().argmax(1)
         return p
 
@@ -102,17 +101,17 @@ class Centres(Identity):
     def __init__(self, g: Gaussians, parts: int, config: IdentityConfig, extent: float) -> None:
         self.config = config
         self.alive = torch.bincount(g.part, minlength=parts) > 0
-        centres, radii = torch.zeros((parts, 3)), torch.ones(parts)
-        for k in g.part.unique().tolist():
+        centres, radii = g.means.new_zeros((parts, 3)), g.means.new_ones(parts)
+        for k in g.part.unique().cpu().tolist():
             mine = g.means[g.part == k]
             centres[k] = mine.mean(0)
             radii[k] = (mine - centres[k]).norm(dim=1).max().clamp_min(0.01 * extent) / 2
         self.centres = centres.requires_grad_()
         self.log_scales = radii.log()[:, None].repeat(1, 3).requires_grad_()
-        self.quats = torch.tensor([1.0, 0, 0, 0]).repeat(parts, 1).requires_grad_()
+        self.quats = torch.tensor([1.0, 0, 0, 0]).to(g.means).repeat(parts, 1).requires_grad_()
         rates = ((self.centres, 1e-3 * extent), (self.log_scales, 1e-2), (self.quats, 1e-3))
         self.adam = torch.optim.Adam([{"params": [v], "lr": rate} for v, rate in rates])
-        self.extra = {"residual": (torch.zeros((len(g), parts)), config.rate)}
+        self.extra = {"residual": (g.means.new_zeros((len(g), parts)), config.rate)}
 
     def probabilities(self, optimiser: GaussianAdam, progress: float) -> Tensor | None:
         # The gradients of the step before: this is called once a step.
@@ -165,10 +164,9 @@ def identity_of(
 
 def _matched_shift(g: Gaussians, own: Gaussians, rng: np.random.Generator, limit: int = 2000) -> Tensor:
     """(n, 3) from each Gaussian to its match in a state's own; what has none takes its nearest neighbour's way."""
-    means = g.means.numpy()
-    i, j = one_to_one(means, own.means.numpy(), limit, rng)
-    way = own.means.numpy()[j] - means[i]
-    return torch.from_numpy(way[KDTree(means[i]).query(means)[1]])
+    i, j = one_to_one(g.means.cpu().numpy(), own.means.cpu().numpy(), limit, rng)
+    way = own.means[j].to(g.means) - g.means[i]
+    return way[nearest(g.means, g.means[i])[1][:, 0]]
 
 
 def parts_of_shifts(means: Tensor, shift: Tensor, parts: int, seed: int) -> tuple[Tensor, np.ndarray]:

@@ -83,26 +83,26 @@ class JointPoses:
         values: np.ndarray,
         extent: float,
         parents: Sequence[int] = (),
+        device: torch.device | str = "cpu",
     ) -> None:
         """``axes`` and ``pivots`` (joints, 3); ``values`` (states − 1, joints), radians or scene units.
 
         ``parents`` are part ids, joint j being that of part j + 1; all the base if none are given.
         """
         self.extent, self.parents = extent, list(parents) or [0] * len(types)
-        self.revolute = torch.tensor([kind == "revolute" for kind in types])
+        self.revolute = torch.tensor([kind == "revolute" for kind in types]).to(device)
         basis = []
         for axis in axes:
             u = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
             u /= np.linalg.norm(u)
             basis.append(np.stack([u, np.cross(axis, u)]))
-        self.across = torch.from_numpy(np.stack(basis)).float()
-        self.axis0 = torch.from_numpy(axes).float()
-        self.pivot0 = torch.from_numpy(pivots).float()
-        self.value0 = torch.from_numpy(values).float()
+        self.across, self.axis0, self.pivot0, self.value0 = (
+            torch.from_numpy(x).float().to(device) for x in (np.stack(basis), axes, pivots, values)
+        )
         unit = torch.where(self.revolute, 1.0, extent)
         self.unit = unit
         # Two tilts of the axis, two shifts of the pivot across it, then a change of the value in every state.
-        self.theta = torch.zeros((len(types), 4 + len(values)), requires_grad=True)
+        self.theta = torch.zeros((len(types), 4 + len(values)), requires_grad=True, device=device)
 
     @property
     def parameters(self) -> list[Tensor]:
@@ -127,8 +127,8 @@ class JointPoses:
         R = rotvec_to_matrix(angle[..., None] * axis)
         turn = pivot - (R @ pivot[..., None])[..., 0]
         t = torch.where(self.revolute[:, None], turn, value[..., None] * axis)
-        eye = torch.eye(3).expand(len(value), 1, 3, 3)
-        R, t = torch.cat([eye, R], 1), torch.cat([torch.zeros((len(value), 1, 3)), t], 1)
+        eye = torch.eye(3, device=R.device).expand(len(value), 1, 3, 3)
+        R, t = torch.cat([eye, R], 1), torch.cat([t.new_zeros((len(value), 1, 3)), t], 1)
         return self._on_parents(R, t) if any(self.parents) else (R, t)
 
     def _on_parents(self, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
@@ -154,6 +154,7 @@ def find_joints(
     *,
     maps: Sequence[Sequence[DepthMap]] = (),
     seed: int = 0,
+    device: torch.device | str = "cpu",
     report: Report = lambda **_: None,
 ) -> JointResult:
     """Each part's motions to one joint, and everything refined with the joints as constraints.
@@ -163,6 +164,7 @@ def find_joints(
         T_state_0: (states, parts, 4, 4) free rigid motions.
         state_sh: (states, n, 3) colour offsets.
         maps: the depth of every photograph where it is known.
+        device: where to optimise; what comes out is on the CPU.
     """
     rng = np.random.default_rng(seed)
     low, high = np.quantile(gaussians.means.numpy(), [0.002, 0.998], axis=0)
@@ -170,16 +172,17 @@ def find_joints(
     n_parts = T_state_0.shape[1]
     if n_parts == 1:
         return JointResult(gaussians, state_sh, ())
-    training = training_views(views, maps)
+    training = training_views(views, maps, device)
     centroids = part_centres(gaussians, n_parts).double().numpy()[1:]
     points = [gaussians.means[gaussians.part == k].double().numpy() for k in range(n_parts)]
     parents = parents_of(T_state_0, points, extent)
+    gaussians, state_sh = gaussians.to(device), state_sh.to(device)
     T_parent = np.linalg.inv(T_state_0[1:, parents]) @ T_state_0[1:, 1:]
 
     def poses_of(kinds: Sequence[str]) -> JointPoses:
         start = [closest_joint(k, T_parent[:, i], centroids[i]) for i, k in enumerate(kinds)]
         axes, pivots, values = (np.stack(column) for column in zip(*start, strict=True))
-        return JointPoses(kinds, axes, pivots, values.T, extent, parents)
+        return JointPoses(kinds, axes, pivots, values.T, extent, parents, device)
 
     kinds, confidence = _choose_types(gaussians, state_sh, training, poses_of, n_parts - 1, config, rng)
     poses = poses_of(kinds)
@@ -202,6 +205,7 @@ def find_joints(
     all_sh = torch.cat([torch.zeros_like(offsets[:1]), offsets]).contiguous()
     deviation = _standard_deviations(finished, all_sh, training, poses, config)
     seen = _views_that_show(finished, training, poses)
+    finished, all_sh = finished.to("cpu"), all_sh.cpu()
     pixel = float(np.median([_pixel(v.camera, finished) for state in training for v in state]))
     joints = _joints(kinds, poses, finished, confidence, deviation, seen, sum(len(s) for s in training), pixel)
     return JointResult(finished, all_sh, joints)
@@ -272,7 +276,7 @@ def _standard_deviations(
             R, t = poses.Rt()
             loss = pose_loss(g, R[s], t[s], training[s][i], config.render.ssim_weight, sh[s])
             (grad,) = torch.autograd.grad(loss, poses.theta)
-            rows.append(grad.double().numpy())
+            rows.append(grad.cpu().double().numpy())
         return np.stack(rows)
 
     n_views = sum(len(state) for state in training[1:])
@@ -303,7 +307,7 @@ def _standard_deviations(
 def _views_that_show(g: Gaussians, training: Sequence[Sequence[TrainingView]], poses: JointPoses) -> np.ndarray:
     """(joints,) number of photographs in which a part covers at least 30 pixels."""
     shown = [(r.channels > 0.5).flatten(1).sum(1) >= 30 for _, r in drawn_parts(g, *poses.Rt(), training)]
-    return torch.stack(shown).sum(0).numpy()
+    return torch.stack(shown).sum(0).cpu().numpy()
 
 
 def _ambiguity(kind: JointType, points: np.ndarray, axis: np.ndarray, pivot: np.ndarray) -> str:
@@ -331,8 +335,8 @@ def _joints(
     pixel: float,
 ) -> tuple[Joint, ...]:
     """``pixel`` is the size of a photograph's pixel on the object, scene units."""
-    axes, pivots = (x.detach().double().numpy() for x in (poses.axis(), poses.pivot()))
-    values = poses.values().detach().double().numpy()
+    axes, pivots = (x.detach().cpu().double().numpy() for x in (poses.axis(), poses.pivot()))
+    values = poses.values().detach().cpu().double().numpy()
     centroids = part_centres(g, len(kinds) + 1).double().numpy()[1:]
     joints = []
     for j, kind in enumerate(kinds):

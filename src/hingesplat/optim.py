@@ -54,7 +54,7 @@ class Moments:
         rate = rate / (1 - BETA1**self.steps)
         shrink = 1 / math.sqrt(1 - BETA2**self.steps)
         tensors = (value.detach(), gradient.contiguous(), self.first, self.second)
-        if value.is_cuda or any(t.dtype != torch.float32 for t in tensors):
+        if value.device.type != "cpu" or any(t.dtype != torch.float32 for t in tensors):
             self.first.lerp_(gradient, 1 - BETA1)
             self.second.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
             value.detach().addcdiv_(self.first, (self.second.sqrt() * shrink).add_(EPSILON), value=-rate)
@@ -112,6 +112,10 @@ class GaussianAdam:
         """The Gaussians as they stand; tensors are the optimised leaves themselves."""
         return Gaussians(**{name: self.values[name] for name in PARAMETERS}, part=self.part)
 
+    def fresh_statistics(self) -> Tensor:
+        """(n, 3) zeros for ``rasterize`` to take its ``screen_gradient`` down in."""
+        return torch.zeros_like(self.values["means"], requires_grad=False)
+
     def step(self, progress: float) -> None:
         """One update; ``progress`` in [0, 1] sets the decay. Gradients are cleared."""
         lobes = self.values["sh"].detach()[:, 1:]
@@ -150,10 +154,10 @@ def densify(optimiser: GaussianAdam, hot: Tensor, split_above: float, generator:
     g = optimiser.gaussians
     first_new = len(optimiser)
     large = g.scales[hot].amax(1) > split_above
-    noise = torch.randn((int(large.sum()), 3), generator=generator) * g.scales[hot[large]]
+    noise = torch.randn((int(large.sum()), 3), generator=generator).to(g.means) * g.scales[hot[large]]
     offset = (wxyz_to_matrix(g.quats[hot[large]]) @ noise[..., None])[..., 0]
     optimiser.duplicate(hot)
-    new = first_new + torch.arange(len(hot))
+    new = first_new + torch.arange(len(hot), device=hot.device)
     for rows, sign in ((hot[large], -1.0), (new[large], 1.0)):
         optimiser.values["log_scales"][rows] -= math.log(1.6)
         optimiser.values["means"][rows] += sign * offset
@@ -163,7 +167,7 @@ def morton_order(points: Tensor) -> Tensor:
     """Indices (n,) that sort points (n, 3) along a Z-order curve, so that neighbours share cache lines."""
     low, high = points.amin(0), points.amax(0)
     q = ((points - low) / (high - low + 1e-9) * 1023).long()
-    code = torch.zeros(len(points), dtype=torch.int64)
+    code = torch.zeros_like(q[:, 0])
     for bit in range(10):
         for axis in range(3):
             code |= ((q[:, axis] >> bit) & 1) << (3 * bit + axis)

@@ -6,7 +6,6 @@ from typing import Literal
 
 import numpy as np
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from hingesplat.gaussians import Gaussians
@@ -16,7 +15,7 @@ from hingesplat.losses.part import soft_motion
 from hingesplat.losses.repel import repel_force, sample_repel_points
 from hingesplat.losses.vector_field import vector_loss
 from hingesplat.losses.velocity import fit_parts, velocity_loss
-from hingesplat.matching import one_to_one
+from hingesplat.matching import nearest, one_to_one
 from hingesplat.optim import GaussianAdam
 
 
@@ -140,11 +139,11 @@ class Targets:
         self.aims: list[Aim] = []
         self.extra: dict[str, tuple[Tensor, float]] = {}
         if self.fitted and config.targets == "matched":
-            places = torch.full((len(g), len(fitted), 3), torch.nan)
+            places = g.means.new_full((len(g), len(fitted), 3), torch.nan)
             for state, own in enumerate(fitted):
                 rng = np.random.default_rng(seed)
-                i, j = one_to_one(g.means.numpy(), own.means.numpy(), config.matched, rng)
-                places[i, state] = own.means[j]
+                i, j = one_to_one(g.means.cpu().numpy(), own.means.cpu().numpy(), config.matched, rng)
+                places[i, state] = own.means[j].to(places)
             # A value that is never stepped: its rows follow the Gaussians when they are split and sorted.
             self.extra = {"target": (places, 0.0)}
 
@@ -169,9 +168,10 @@ class Targets:
 
     def _nearest(self, g: Gaussians, p: Tensor, R: Tensor, t: Tensor, own: Gaussians) -> Aim:
         moved = soft_motion(g.means, p, R, t)
-        distance, index = map(np.asarray, KDTree(own.means.numpy()).query(moved.numpy()))
-        rows = np.flatnonzero(distance < self.config.reach * self.extent)
-        return Aim(torch.from_numpy(rows), own.means[torch.from_numpy(index[rows])])
+        points = own.means.to(moved)
+        distance, index = nearest(moved, points)
+        rows = torch.nonzero(distance[:, 0] < self.config.reach * self.extent)[:, 0]
+        return Aim(rows, points[index[rows, 0]])
 
 
 def one_hot(g: Gaussians, parts: int) -> Tensor:
@@ -193,7 +193,7 @@ def physics_loss(
 
     ``p`` (n, K) is None for the hard labels of ``g``.
     """
-    total = torch.zeros(())
+    total = g.means.new_zeros(())
     if not (config.aims or config.contact or config.velocity):
         return total
     if p is None:

@@ -38,6 +38,7 @@ from hingesplat.gaussians import Gaussians, posed
 from hingesplat.joints import JointsConfig, find_joints
 from hingesplat.mesh import MeshConfig, mesh_parts
 from hingesplat.pictures import movable_share, write_motion_gif, write_summary
+from hingesplat.render import cuda_lacks
 from hingesplat.report import spread_views, write_report, write_views
 from hingesplat.run_folder import (
     load_meshes,
@@ -87,6 +88,8 @@ class ReconstructConfig:
     """Of every random choice; the same seed on the same machine gives the same joints."""
     max_size: int | None = None
     """Photographs longer than this many pixels are downsampled."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where Gaussians are optimised. ``auto`` takes CUDA where there is a device and gsplat is installed."""
     depth: bool = False
     """Take depth from the capture's depth pictures instead of finding it by stereo."""
     stereo: StereoConfig = field(default_factory=StereoConfig)
@@ -172,6 +175,11 @@ class Run:
         return partial(self.report, stage=stage, **more)
 
     @property
+    def device(self) -> str:
+        """Where Gaussians are optimised: cpu or cuda."""
+        return optimising_device(self.config.device)
+
+    @property
     def views(self) -> list[Sequence[View]]:
         """The training photographs of every state."""
         return [state.train for state in self.capture.states]
@@ -208,6 +216,7 @@ def reconstruct(
     """
     config = config or ReconstructConfig()
     _check(config)
+    optimising_device(config.device)
     capture = _capped(capture, config.max_size)
     folder = Path(tempfile.mkdtemp(prefix="hingesplat-")) if out is None else Path(out)
     open_folder(folder, capture, config, overwrite)
@@ -215,7 +224,7 @@ def reconstruct(
     curves = Curves(folder / "curves.json", report)
     run = Run(folder, capture, config, curves.report)
     try:
-        with log_file(folder / "log.txt"), _repeatable():
+        with log_file(folder / "log.txt"), _repeatable(run.device):
             log.info("%s to %s", capture.path, folder)
             _run_stages(run, curves)
     finally:
@@ -263,7 +272,8 @@ def _fit(run: Run) -> None:
     paths = {t: run / f"fit_state{t}.safetensors" for t in range(len(run.views))}
     left = [t for t, path in paths.items() if not path.is_file()]
     threads, stopped, one_at_a_time = torch.get_num_threads(), Event(), Lock()
-    at_once = max(1, min(threads, len(left)))
+    # Kernels of a GPU are called one after another in any case.
+    at_once = max(1, min(threads, len(left))) if run.device == "cpu" else 1
 
     def fit_state(t: int) -> None:
         torch.set_num_threads(threads // at_once)  # Of this Python thread only.
@@ -275,7 +285,7 @@ def _fit(run: Run) -> None:
                 run.report(stage="fit", state=t, **numbers)
 
         config, seed = run.config.fit, run.config.seed
-        fit(run.views[t], config, seed=seed, maps=_depth(run, t), report=report).save(paths[t])
+        fit(run.views[t], config, seed=seed, maps=_depth(run, t), device=run.device, report=report).save(paths[t])
 
     with ThreadPoolExecutor(at_once) as pool:
         fits = [pool.submit(fit_state, t) for t in left]
@@ -391,8 +401,9 @@ def _articulate(run: Run) -> None:
         config, report = run.config.articulate, run.reporting("articulate")
         seed = run.config.seed
         moved = articulate(
-            canonical, T_state_0, run.views, config, fitted=fitted, maps=_depths(run), seed=seed, report=report
-        )
+            canonical, T_state_0, run.views, config,
+            fitted=fitted, maps=_depths(run), seed=seed, device=run.device, report=report,
+        )  # fmt: skip
     extra = {"T_state_0": torch.from_numpy(np.asarray(moved.T_state_0)), "state_sh": moved.state_sh}
     write_tensors(run / "articulation.safetensors", vars(moved.gaussians) | extra)
 
@@ -406,7 +417,9 @@ def _joints(run: Run) -> None:
     if T_state_0.shape[1] > 1:
         config, report = run.config.joints, run.reporting("joints")
         maps, seed = _depths(run), run.config.seed
-        found = find_joints(gaussians, T_state_0, state_sh, run.views, config, maps=maps, seed=seed, report=report)
+        found = find_joints(
+            gaussians, T_state_0, state_sh, run.views, config, maps=maps, seed=seed, device=run.device, report=report
+        )
         gaussians, state_sh, joints = found.gaussians, found.state_sh, found.joints
     gaussians = gaussians.detached()
     ids = [0, *sorted(j.child for j in joints)]
@@ -506,6 +519,20 @@ def _depths(run: Run) -> list[list[DepthMap]]:
     return [_depth(run, t) for t in range(len(run.views))]
 
 
+def optimising_device(wanted: Literal["auto", "cpu", "cuda"]) -> str:
+    """``cpu`` or ``cuda``; see ``ReconstructConfig.device``.
+
+    Raises:
+        HingesplatError: CUDA is wanted and there is none, or gsplat is not installed.
+    """
+    if wanted == "cpu":
+        return wanted
+    lacking = cuda_lacks()
+    if lacking and wanted == "cuda":
+        raise HingesplatError(f"device: cuda is wanted, but {lacking}")
+    return "cpu" if lacking else "cuda"
+
+
 def _check(config: ReconstructConfig) -> None:
     if config.parts != "auto" and config.parts < 2:
         raise HingesplatError(f"parts: must be auto, or at least 2 (the base and a mover), not {config.parts}")
@@ -559,7 +586,6 @@ def _capped(capture: Capture, max_size: int | None) -> Capture:
 def _write_summary(run: Run, finished: dict[str, Any]) -> None:
     seconds = {name: entry["seconds"] for name, entry in finished.items()}
     peaks = [entry["peak_memory_mb"] for entry in finished.values()]
-    device = Gaussians.load(run / "gaussians.safetensors").means.device.type
     summary = {
         "seconds": seconds | {"total": round(sum(seconds.values()), 2)},
         "peak_memory_mb": max((p for p in peaks if p is not None), default=None),
@@ -567,8 +593,8 @@ def _write_summary(run: Run, finished: dict[str, Any]) -> None:
         "preset": run.config.preset,
         "method": run.config.method,
         "seed": run.config.seed,
-        "device": device,
-        "backend": "gsplat" if device == "cuda" else "numba",
+        "device": run.device,
+        "backend": "gsplat" if run.device == "cuda" else "numba",
         "machine": f"{platform.machine()}, {torch.get_num_threads()} threads",
         "versions": versions(),
     }
@@ -586,10 +612,13 @@ def peak_memory_mb() -> float | None:
 
 
 @contextmanager
-def _repeatable() -> Iterator[None]:
-    """Torch's threads add up gradients of indexed tensors in one order: the same seed gives the same joints."""
+def _repeatable(device: str) -> Iterator[None]:
+    """Torch's threads add up gradients of indexed tensors in one order: the same seed gives the same joints.
+
+    On the CPU; gsplat's kernels add as they come.
+    """
     before = torch.are_deterministic_algorithms_enabled()
-    torch.use_deterministic_algorithms(not torch.cuda.is_available())
+    torch.use_deterministic_algorithms(device == "cpu")
     try:
         yield
     finally:

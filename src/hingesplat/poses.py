@@ -76,7 +76,7 @@ def pose_loss(
     g: Gaussians, R: Tensor, t: Tensor, view: TrainingView, ssim_weight: float, sh_offset: Tensor | None = None
 ) -> Tensor:
     """What one photograph says of its state's part poses alone: L_render of Gaussians that are what they are."""
-    r = draw_state(g, R, t, view.camera, sh_offset=sh_offset, background=torch.ones(3))
+    r = draw_state(g, R, t, view.camera, sh_offset=sh_offset, background=g.means.new_ones(3))
     return photometric(r.rgba, view.target, ssim_weight)
 
 
@@ -128,7 +128,7 @@ def drawn_parts(
         training: photographs of every state.
         state_sh: (states, n, 3) colour offsets.
     """
-    membership, white = torch.nn.functional.one_hot(g.part, R.shape[1]).float()[:, 1:], torch.ones(3)
+    membership, white = torch.nn.functional.one_hot(g.part, R.shape[1]).float()[:, 1:], g.means.new_ones(3)
     for s, views in enumerate(training):
         offset = None if state_sh is None else state_sh[s]
         for view in views:
@@ -159,7 +159,7 @@ def errors_by_part(
         region = torch.nn.functional.max_pool2d(tall, (1, 15), 1, (0, 7))[0] > 0.3
         area = region.flatten(1).sum(1)
         mean = (error * region).flatten(1).sum(1) / area.clamp_min(1)
-        rows.append(torch.where(area > 30, mean, torch.nan).numpy())
+        rows.append(torch.where(area > 30, mean, torch.nan).cpu().numpy())
     return np.stack(rows)
 
 

@@ -13,8 +13,22 @@ def wxyz_to_matrix(quats: Tensor) -> Tensor:
 
 
 def matrix_to_wxyz(R: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) to unit quaternions (..., 4) wxyz."""
-    return roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(R))
+    """Rotation matrices (..., 3, 3) to unit quaternions (..., 4) wxyz, the largest component positive.
+
+    4 q qᵀ is linear in R, and its row with the largest diagonal is the best q. roma's function branches on numbers,
+    for which a GPU would have to wait for the host.
+    """
+    a, b, c, d, e, f, g, h, i = R.flatten(-2).unbind(-1)
+    rows = (
+        (1 + a + e + i, h - f, c - g, d - b),
+        (h - f, 1 + a - e - i, b + d, c + g),
+        (c - g, b + d, 1 - a + e - i, f + h),
+        (d - b, c + g, f + h, 1 - a - e + i),
+    )
+    outer = torch.stack([torch.stack(row, -1) for row in rows], -2)
+    best = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    row = outer.gather(-2, best[..., None, None].expand(*best.shape, 1, 4))
+    return torch.nn.functional.normalize(row[..., 0, :], dim=-1)
 
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:

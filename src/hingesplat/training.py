@@ -1,10 +1,8 @@
 """What every optimisation loop shares: prepared photographs, depth regularisers, growing and pruning the set."""
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
-from statistics import fmean
 from typing import Protocol
 from weakref import finalize
 
@@ -41,6 +39,8 @@ class TrainingView:
     """(h, w, 4) uint8, straight alpha: a window of the photograph, not a copy."""
     known: DepthMap | None = None
     """What stereo knows of it."""
+    device: torch.device | str = "cpu"
+    """Where its target is."""
     _target: Target | None = None
 
     @property
@@ -48,9 +48,9 @@ class TrainingView:
         """``image``, with what the loss needs of it."""
         if self._target is not None:
             return self._target
-        rgba = torch.from_numpy(self.rgba.astype(np.float32) / 255).permute(2, 0, 1)
+        rgba = torch.tensor(self.rgba).to(self.device).permute(2, 0, 1).float() / 255
         image = torch.cat([rgba[:3] * rgba[3:] + 1 - rgba[3:], rgba[3:]])
-        target = Target.of(image, None if self.known is None else torch.from_numpy(self._depth()))
+        target = Target.of(image, None if self.known is None else torch.from_numpy(self._depth()).to(self.device))
         if _kept_bytes + target.nbytes <= KEPT_BYTES:
             _count_kept(target.nbytes)
             finalize(self, _count_kept, -target.nbytes)
@@ -79,7 +79,9 @@ def _count_kept(nbytes: int) -> None:
     _kept_bytes += nbytes
 
 
-def training_view(view: View, known: DepthMap | None = None, margin: int = 8) -> TrainingView:
+def training_view(
+    view: View, known: DepthMap | None = None, device: torch.device | str = "cpu", margin: int = 8
+) -> TrainingView:
     """Crop to the mask's rectangle plus a margin: what lies outside is background in every render, too."""
     alpha = view.rgba[..., 3]
     height, width = alpha.shape
@@ -89,15 +91,15 @@ def training_view(view: View, known: DepthMap | None = None, margin: int = 8) ->
     x0, x1 = max(columns[0] - margin, 0), min(columns[-1] + margin + 1, width)
     y0, y1 = max(rows[0] - margin, 0), min(rows[-1] + margin + 1, height)
     camera = view.camera.cropped(int(x0), int(y0), int(x1 - x0), int(y1 - y0))
-    return TrainingView(camera, view.rgba[y0:y1, x0:x1], known)
+    return TrainingView(camera, view.rgba[y0:y1, x0:x1], known, device)
 
 
 def training_views(
-    states: Sequence[Sequence[View]], maps: Sequence[Sequence[DepthMap]] = ()
+    states: Sequence[Sequence[View]], maps: Sequence[Sequence[DepthMap]] = (), device: torch.device | str = "cpu"
 ) -> list[list[TrainingView]]:
     """The photographs of every state with what is known of their depth, if anything."""
     return [
-        [training_view(view, known) for view, known in zip_longest(views, depths)]
+        [training_view(view, known, device) for view, known in zip_longest(views, depths)]
         for views, depths in zip_longest(states, maps, fillvalue=())
     ]
 
@@ -106,19 +108,21 @@ def averaged(report: Report, steps: int) -> Callable[[Tensor, Tensor, int], None
     """Tell it ``loss, error, gaussians`` after each step; it reports after the first and every so many.
 
     Loss and PSNR are means over the steps since the last report: each saw one photograph, and some are harder.
-    ``error`` are mean squared errors of r, g, b and more.
+    ``error`` are mean squared errors of r, g, b and more. Until it reports, nothing waits for a GPU.
     """
-    step, losses, scores = 0, [], []
+    step, losses, errors = 0, [], []
 
     def after_step(loss: Tensor, error: Tensor, gaussians: int) -> None:
         nonlocal step
-        losses.append(float(loss.detach()))
-        scores.append(-10 * math.log10(max(fmean(error[:3].tolist()), 1e-12)))
+        losses.append(loss.detach())
+        errors.append(error[:3].mean())
         step += 1
         if (step - 1) % REPORT_EVERY == 0 or step == steps:
-            report(step=step, steps=steps, loss=fmean(losses), psnr=fmean(scores), gaussians=gaussians)
+            psnr = -10 * torch.stack(errors).clamp_min(1e-12).log10().mean()
+            mean_loss = torch.stack(losses).mean()
+            report(step=step, steps=steps, loss=float(mean_loss), psnr=float(psnr), gaussians=gaussians)
             losses.clear()
-            scores.clear()
+            errors.clear()
 
     return after_step
 
@@ -142,7 +146,7 @@ def view_loss(
     Returns:
         The loss, and (4,) mean squared error of r, g, b and alpha.
     """
-    options = {"background": torch.ones(3), "screen_gradient": statistics}
+    options = {"background": placed.means.new_ones(3), "screen_gradient": statistics}
     weight = config.depth_variance_weight / extent**2
     if weight == 0:
         rgba, depths = rasterize(*placed.drawn, view.camera, **options).rgba, None
@@ -191,10 +195,10 @@ def seen_weight(gaussians: Gaussians, cameras: Sequence[Camera]) -> Tensor:
 
     The gradient of a picture's sum with respect to a per-Gaussian channel of ones is that Gaussian's weight.
     """
-    best = torch.zeros(len(gaussians))
+    best = torch.zeros_like(gaussians.logit_opacities)
     for camera in cameras:
         with torch.enable_grad():
-            ones = torch.ones((len(gaussians), 1), requires_grad=True)
+            ones = torch.ones_like(best[:, None], requires_grad=True)
             (weight,) = torch.autograd.grad(render(gaussians, camera, channels=ones).channels.sum(), ones)
         best = torch.maximum(best, weight[:, 0])
     return best

@@ -2,8 +2,9 @@
 
 import torch
 from jaxtyping import Float
-from scipy.spatial import KDTree
 from torch import Tensor
+
+from hingesplat.matching import nearest
 
 
 def contact_loss(
@@ -23,8 +24,7 @@ def contact_loss(
     """
     if len(mu) == 0 or len(mu_static) == 0:
         return mu.sum() * 0
-    nearest = KDTree(mu_static.detach().cpu().numpy()).query(mu.detach().cpu().numpy())[1]
-    to_surface = mu_static[torch.from_numpy(nearest).to(mu.device)] - mu
+    to_surface = mu_static[nearest(mu, mu_static)[1][:, 0]] - mu
     to_centre = mu_static.mean(0) - mu
     cosine = torch.nn.functional.cosine_similarity(to_surface, to_centre, dim=-1, eps=1e-12)
     inside = cosine.neg().clamp_min(0)

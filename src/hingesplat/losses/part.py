@@ -2,8 +2,9 @@
 
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import KDTree
 from torch import Tensor
+
+from hingesplat.matching import nearest
 
 TINY = 1e-12
 
@@ -18,11 +19,10 @@ def part_probabilities(
 def nearest_neighbours(mu: Float[Tensor, "n 3"], k: int) -> Int[Tensor, "n k2"]:
     """Indices (n, min(k, n − 1)) of the nearest other centres. Changes slowly in training: cache it."""
     n = mu.shape[0]
-    points = mu.detach().cpu().numpy()
-    index = torch.from_numpy(KDTree(points).query(points, k=min(k, n - 1) + 1)[1].reshape(n, -1))
-    itself = index == torch.arange(n)[:, None]
+    index = nearest(mu, mu, min(k, n - 1) + 1)[1]
+    itself = index == torch.arange(n, device=mu.device)[:, None]
     itself[~itself.any(1), -1] = True  # Lost among duplicates of itself: drop the farthest instead.
-    return index[~itself].reshape(n, -1).to(mu.device)
+    return index[~itself].reshape(n, -1)
 
 
 def part_loss(F: Float[Tensor, "n K"], neighbours: Int[Tensor, "n k"]) -> Float[Tensor, ""]:

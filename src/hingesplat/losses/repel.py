@@ -2,9 +2,10 @@
 
 import torch
 from jaxtyping import Float
-from scipy.spatial import KDTree
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
+
+from hingesplat.matching import nearest
 
 ROWS = 1024
 """Gaussians handled at once in the full sum: 1024 × 2000 points × 3 floats are 25 MB."""
@@ -30,8 +31,7 @@ def sample_repel_points(
         return static.new_zeros(0, 3)
     everything = torch.cat([static, movable])
     extent = float(torch.linalg.vector_norm(everything.amax(0) - everything.amin(0)))
-    distance = KDTree(movable.cpu().numpy()).query(static.cpu().numpy())[0]
-    region = static[torch.from_numpy(distance <= threshold * extent).to(static.device)]
+    region = static[nearest(static, movable)[0][:, 0] <= threshold * extent]
     if len(region) == 0:
         return region
     if len(region) >= N_R:
@@ -49,7 +49,7 @@ def repel_force(
     epsilon: float = 1e-5,
     tau_max: float = 1e-3,
     exponent: float = 3.0,
-    nearest: int | None = 32,
+    neighbours: int | None = 32,
 ) -> Float[Tensor, "n 3"]:
     """F_repel,i = clip( Σ_j k_r (μ_i − r_j) / max(‖r_j − μ_i‖, ε)^p, τ_max ), a displacement in scene units.
 
@@ -61,16 +61,14 @@ def repel_force(
     The push is away from points, not out of a solid: a Gaussian that is already through a one-sided sheet of
     repel points is pushed on. ``contact.contact_loss`` is the term that knows inside from outside.
 
-    Cost: ``nearest`` keeps only that many repel points a Gaussian (found with a k-d tree): n · nearest terms,
+    Cost: ``neighbours`` keeps only that many repel points a Gaussian (found with a k-d tree): n · neighbours terms,
     without the far remainder of the sum. None takes all m points in chunks of rows that are recomputed in the
     backward pass, so memory stays flat. Differentiable in ``mu``, and in ``r``.
     """
     if len(r) == 0 or len(mu) == 0:
         return torch.zeros_like(mu)
-    if nearest is not None and nearest < len(r):
-        index = KDTree(r.detach().cpu().numpy()).query(mu.detach().cpu().numpy(), k=nearest)[1]
-        near = r[torch.from_numpy(index.reshape(len(mu), nearest)).to(mu.device)]
-        force = _push(mu, near, k_r, epsilon, exponent)
+    if neighbours is not None and neighbours < len(r):
+        force = _push(mu, r[nearest(mu, r, neighbours)[1]], k_r, epsilon, exponent)
     else:
         force = torch.cat([_push_all(rows, r, k_r, epsilon, exponent) for rows in mu.split(ROWS)])
     return _clip(force, tau_max)

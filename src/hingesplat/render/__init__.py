@@ -12,6 +12,7 @@ from torch import Tensor
 from hingesplat.camera import Camera
 from hingesplat.errors import HingesplatError
 from hingesplat.gaussians import Gaussians
+from hingesplat.render.gsplat_backend import cuda_lacks
 from hingesplat.render.place import Placed, move, place, sh_basis, sh_to_rgb
 
 Backend = Literal["torch", "numba", "gsplat"]
@@ -63,7 +64,7 @@ def rasterize(
         colors: (n, 3) rgb.
         channels: (n, C) further values to blend like colours.
         background: (3,) rgb behind everything; black if None. It shows in ``rgb`` only.
-        backend: None takes ``gsplat`` for CUDA tensors, ``numba`` for float32 and ``torch`` for other types.
+        backend: None takes ``gsplat`` for tensors off the CPU, ``numba`` for float32 and ``torch`` for other types.
         early_stop: end a pixel once its transmittance has fallen to 1e-4.
         screen_gradient: (n, 3) float statistics that the backward pass updates for every visible Gaussian: column 0
             grows by |d loss / d (projected mean)| (per pixel), column 1 by one, and column 2 becomes the
@@ -98,7 +99,7 @@ def rasterize(
 
 
 def _default_backend(means: Tensor) -> Backend:
-    if means.is_cuda:
+    if means.device.type != "cpu":
         return "gsplat"
     return "numba" if means.dtype == torch.float32 else "torch"
 
@@ -108,4 +109,15 @@ def render(gaussians: Gaussians, camera: Camera, **options) -> Rendering:
     return rasterize(*place(gaussians, camera).drawn, camera, **options)
 
 
-__all__ = ["Backend", "Placed", "Rendering", "move", "place", "rasterize", "render", "sh_basis", "sh_to_rgb"]
+__all__ = [
+    "Backend",
+    "Placed",
+    "Rendering",
+    "cuda_lacks",
+    "move",
+    "place",
+    "rasterize",
+    "render",
+    "sh_basis",
+    "sh_to_rgb",
+]

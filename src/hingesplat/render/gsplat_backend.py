@@ -1,6 +1,7 @@
 """The CUDA engine: gsplat 1.5.3 (Ye et al. 2024, Apache-2.0), an optional dependency."""
 
 from collections.abc import Callable
+from importlib.util import find_spec
 from typing import Any
 
 import torch
@@ -42,7 +43,7 @@ def rasterize(
         opacities,
         torch.cat([colors, channels], dim=1),
         torch.as_tensor(camera.T_camera_world).to(means)[None],
-        torch.tensor(intrinsics, dtype=means.dtype, device=means.device)[None],
+        torch.tensor(intrinsics, dtype=torch.float64).to(means)[None],
         camera.width,
         camera.height,
         near_plane=NEAR,
@@ -52,22 +53,28 @@ def rasterize(
     )
     if screen_gradient is not None and meta["means2d"].requires_grad:
         radii = meta["radii"][0]
-        seen = torch.nonzero((radii > 0).all(dim=1))[:, 0]
-        radius = radii[seen].amax(dim=1).to(screen_gradient.dtype)
-        meta["means2d"].register_hook(lambda g: record_screen_gradient(screen_gradient, seen, g[0, seen], radius))
+        radius = torch.where((radii > 0).all(dim=1), radii.amax(dim=1), 0).to(screen_gradient.dtype)
+        meta["means2d"].register_hook(lambda g: record_screen_gradient(screen_gradient, g[0], radius))
     alpha = alpha[0, :, :, 0]
     rgb, others, depth = image[0].permute(2, 0, 1).split([3, channels.shape[1], 1])
     return torch.cat([rgb + (1 - alpha) * background[:, None, None], alpha[None]]), depth[0], others
 
 
+def cuda_lacks() -> str:
+    """What keeps CUDA tensors from being drawn on this machine, with its remedy; empty where nothing does."""
+    if not torch.cuda.is_available():
+        return "torch sees no CUDA device; use the CPU"
+    if find_spec("gsplat") is None:
+        return "gsplat is not installed; run pip install 'hingesplat[gsplat]'"
+    return ""
+
+
 def _gsplat(means: Tensor) -> Callable[..., Any]:
     """gsplat's rasteriser, where it can work on ``means``."""
-    if not torch.cuda.is_available():
-        raise HingesplatError("backend gsplat: no CUDA device; use the numba or torch backend")
+    if lacking := cuda_lacks():
+        raise HingesplatError(f"backend gsplat: {lacking}")
     if not means.is_cuda:
         raise HingesplatError("backend gsplat: needs CUDA tensors; move them, or use the numba or torch backend")
-    try:
-        from gsplat import rasterization  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise HingesplatError("backend gsplat: not installed; run pip install 'hingesplat[gsplat]'") from error
+    from gsplat import rasterization  # pyright: ignore[reportMissingImports]
+
     return rasterization

@@ -58,7 +58,7 @@ def place(
         sh_offset: (n, 3) added to the constant colour coefficient.
     """
     at = g.means if means is None else means
-    if at.is_cuda or at.dtype != torch.float32:
+    if at.device.type != "cpu" or at.dtype != torch.float32:
         return place_by_torch(g, camera, pose=pose, means=means, sh_offset=sh_offset)
     lobes = None
     if g.sh.shape[1] > 1:

@@ -75,7 +75,7 @@ def _project(centres: Tensor, quats: Tensor, scales: Tensor, R: Tensor, camera: 
 
 def _reaches_a_pixel(mean: Tensor, extent: Tensor, camera: Camera) -> Tensor:
     """Whether the box mean ± extent holds a pixel centre of the image, (n,) bool."""
-    size = torch.tensor([camera.width, camera.height], dtype=mean.dtype, device=mean.device)
+    size = torch.tensor([camera.width, camera.height]).to(mean)
     first = (mean - extent - 0.5).ceil().clamp(min=0)
     last = torch.minimum((mean + extent - 0.5).floor(), size - 1)
     return (last >= first).all(dim=1)
@@ -108,8 +108,12 @@ def rasterize(
         extent = (spread[:, None] * covariance.diagonal(dim1=1, dim2=2)).sqrt()
         visible = _reaches_a_pixel(mean, extent, camera) & torch.isfinite(covariance).all(dim=(1, 2))
     if screen_gradient is not None and mean.requires_grad:
-        seen, radius = index[visible], extent[visible].amax(dim=1).to(screen_gradient.dtype)
-        mean.register_hook(lambda g: record_screen_gradient(screen_gradient, seen, g[visible], radius))
+        radius = torch.where(visible, extent.amax(dim=1), 0).to(screen_gradient.dtype)
+
+        def of_all(rows: Tensor) -> Tensor:
+            return rows.new_zeros((len(means), *rows.shape[1:])).index_copy(0, index, rows)
+
+        mean.register_hook(lambda g: record_screen_gradient(screen_gradient, of_all(g), of_all(radius)))
 
     mean, precision, o = mean[visible], torch.linalg.inv(covariance[visible]), opacities[index][visible]
     attributes = torch.cat([colors, channels], dim=1)[index][visible]
@@ -133,12 +137,13 @@ def rasterize(
     return torch.cat([rgb + (1 - alpha) * background[:, None, None], alpha]), depth[0], others
 
 
-def record_screen_gradient(statistics: Tensor, seen: Tensor, gradient: Tensor, radius: Tensor) -> None:
-    """Update the densification statistics (n, 3) of the Gaussians with indices ``seen`` (m,).
+def record_screen_gradient(statistics: Tensor, gradient: Tensor, radius: Tensor) -> None:
+    """Update the densification statistics (n, 3) of the Gaussians that are seen: their ``radius`` (n,) is not zero.
 
-    Column 0 grows by the length of the pixel-space ``gradient`` (m, 2), column 1 by one, and column 2 is the
-    largest ``radius`` (m,) so far.
+    Column 0 grows by the length of the pixel-space ``gradient`` (n, 2), column 1 by one, and column 2 is the
+    largest radius so far.
     """
-    statistics[seen, 0] += gradient.norm(dim=1).to(statistics.dtype)
-    statistics[seen, 1] += 1
-    statistics[seen, 2] = torch.maximum(statistics[seen, 2], radius)
+    seen = (radius > 0).to(statistics.dtype)
+    statistics[:, 0] += gradient.norm(dim=1).to(statistics.dtype) * seen
+    statistics[:, 1] += seen
+    statistics[:, 2] = torch.maximum(statistics[:, 2], radius)
