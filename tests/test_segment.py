@@ -527,6 +527,20 @@ def test_of_a_part_the_largest_piece_stays_and_of_the_base_every_large_one() -> 
         np.testing.assert_array_equal(found, np.repeat([0, 0, 1, 0], [400, 100, 225, 196]))
 
 
+def test_of_what_a_fragment_touches_photographs_choose(monkeypatch) -> None:
+    """The inside of a drawer: part 1 by mistake, part 2 by what it touches, though the cabinet is as near."""
+    costs = np.array([0.9, 0.2, 0.25])
+    monkeypatch.setattr(
+        "hingesplat.pieces.label_costs", lambda surface, *_, **__: np.tile(costs, (len(surface.points), 1))
+    )
+    still, other = replace(SHIFT, value=0.0), replace(SHIFT, value=0.6)
+    inside, beside, front = patch((0, 0.9, -0.4), 10), patch((0, 0.9, -0.43), 14), patch((0, 0.9, -0.37), 14)
+    surfaces = both_states((PART, SHIFT), (inside, other), (beside, still), (front, other))
+    given = np.repeat([0, 1, 1, 0, 2], [400, 225, 100, 196, 196])
+    for found in reattach_fragments([SHIFT.T, other.T], (given, given), surfaces, 1.0):
+        assert set(found[625:725]) == {2}
+
+
 @pytest.mark.parametrize(("cost", "label"), [(0.9, 1), (0.3, 0)])
 def test_a_fragment_that_the_photographs_are_sure_of_stays_what_it_is(monkeypatch, cost: float, label: int) -> None:
     """A knife's blade touches only the handle; ``cost`` is what the photographs say of it if it had stayed there."""

@@ -45,19 +45,29 @@ def label_costs(
     """
     columns = []
     for T in [None, *transforms]:
-        points = surface.points if T is None else moved(surface.points, T)
-        answer = ask(points, surface.colours, other)
-        # A point a little in front of its surface floats in some photographs of its own state, too.
-        contradiction = np.clip((free_share(answer) - surface.free_at_home - 0.02) / 0.2, 0, 1)
-        # Every surface is hidden from most sides: a few views that see it there are enough.
-        arrived = np.clip(answer[:, SURFACE] / ARRIVED, 0, 1)
-        colour = np.clip((answer[:, COLOUR] - 0.05) / 0.5, 0, 1)
+        contradiction, arrived, colour = _told(surface, other, T)
         # To move is a claim: it costs a little, and to be recognised far away costs more.
-        way = np.linalg.norm(points - surface.points, axis=1) / extent
+        way = 0 if T is None else np.linalg.norm(moved(surface.points, T) - surface.points, axis=1) / extent
         claim = 0.0 if T is None else 0.05 + far_cost * way * arrived
         unseen = covered_cost if T is None else hidden_cost
         columns.append(contradiction + arrived * 0.5 * colour + (1 - arrived) * unseen + claim)
     return np.stack(columns, 1)
+
+
+def hidden(surface: Surface, other: Sight, T: np.ndarray | None = None) -> np.ndarray:
+    """(n,) bool: points that nobody sees in the other state, nor sees through, where T (4, 4) takes them."""
+    contradiction, arrived, _ = _told(surface, other, T)
+    return (contradiction < 0.1) & (arrived < 0.3)
+
+
+def _told(surface: Surface, other: Sight, T: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What photographs say of points moved by T, (n,) in 0 … 1 each: seen through, seen, and of another colour."""
+    answer = ask(surface.points if T is None else moved(surface.points, T), surface.colours, other)
+    # A point a little in front of its surface floats in some photographs of its own state, too.
+    contradiction = np.clip((free_share(answer) - surface.free_at_home - 0.02) / 0.2, 0, 1)
+    # Every surface is hidden from most sides: a few views that see it there are enough.
+    arrived = np.clip(answer[:, SURFACE] / ARRIVED, 0, 1)
+    return contradiction, arrived, np.clip((answer[:, COLOUR] - 0.05) / 0.5, 0, 1)
 
 
 def seed_costs(

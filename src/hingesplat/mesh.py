@@ -20,6 +20,7 @@ from skimage.measure import marching_cubes
 from trimesh.visual import ColorVisuals
 
 from hingesplat.camera import Camera
+from hingesplat.drawer import drawn_out
 from hingesplat.gaussians import SH_C0, Gaussians, posed
 from hingesplat.render import rasterize
 from hingesplat.se3 import wxyz_to_matrix
@@ -160,6 +161,8 @@ def _solids(
     for i in grids.keys() - {0}:
         T_base_mover = [p.get(i, np.eye(4)) for p in poses]
         mover = _filled(grids[i], surfaces[i], config)
+        walls = _wall(surfaces[i], config), _wall(surfaces[0], config)
+        mover = drawn_out(mover, surfaces[i], surfaces[0], T_base_mover, walls)
         taken = -distance_to(mover, known, [np.linalg.inv(T) for T in T_base_mover]) / mover.truncation
         guess = np.maximum(mover.distance, np.minimum(taken, 1))
         grids[i] = mover = replace(mover, distance=np.where(mover.weight > 0, mover.distance, guess))
@@ -181,10 +184,14 @@ def _fused_grid(views: list[DepthView], surface: np.ndarray, config: MeshConfig)
 def _filled(grid: DistanceGrid, surface: np.ndarray, config: MeshConfig) -> DistanceGrid:
     """The rule for the unseen, and a little smoothing."""
     unseen = grid.weight == 0
-    reach = config.reach * float(np.ptp(surface, axis=0).max())
-    solid = _solid_unseen(grid.distance, unseen, surface, grid.lower, grid.voxel, reach)
+    solid = _solid_unseen(grid.distance, unseen, surface, grid.lower, grid.voxel, _wall(surface, config))
     distance = np.where(unseen, np.where(solid, -1, 1), grid.distance).astype(np.float32)
     return replace(grid, distance=ndimage.gaussian_filter(distance, 0.7))
+
+
+def _wall(surface: np.ndarray, config: MeshConfig) -> float:
+    """How thick the walls of a part count where nobody saw: its surface is (n, 3)."""
+    return config.reach * float(np.ptp(surface, axis=0).max())
 
 
 def _solid_unseen(

@@ -14,6 +14,8 @@ LARGE_PIECE = 0.2
 """A piece this large beside the largest of its part is a part of its own, not a fragment."""
 LEAST_SHARE = 0.001
 """Of each state's surface: a part that shows less of itself in one of them has no way from there to here."""
+TOUCH = 0.05
+"""Extents between points of two parts that touch."""
 SURE = 0.4
 """A fragment that costs so much more with what it touches, on average, stays what it is."""
 
@@ -92,36 +94,39 @@ def _rejoined(motions: Sequence[Motion], owned: Labels, surfaces: tuple[Surface,
 def reattach_fragments(
     T_1_0: Sequence[np.ndarray], owned: Labels, surfaces: tuple[Surface, Surface], extent: float
 ) -> Labels:
-    """Small pieces apart from their part's main one go to whatever they touch: nothing floats in the air.
+    """Small pieces apart from their part's main one go to what they touch, or to the nearest: nothing floats.
 
-    Unless the photographs are sure of them: a knife's blade touches only the handle that it slides in.
+    Of the parts that a piece touches, photographs choose: the inside of a drawer touches the cabinet and the drawer.
+    They may also be sure that it is neither: a knife's blade touches only the handle that it slides in.
     """
-    stray = (np.zeros(len(owned[0]), bool), np.zeros(len(owned[1]), bool))
-    fragments = []
+    fragments: list[tuple[int, list[np.ndarray]]] = []
     for k, T in enumerate([np.eye(4), *T_1_0]):
         rows, piece = _pieces(k, T, owned, surfaces, extent)
         size = np.bincount(np.concatenate(piece), minlength=1)
-        for p in np.flatnonzero((size > 0) & (size < (size.max() if k else 0.02 * size.max()))):
-            fragments.append((k, [rows[s][piece[s] == p] for s in (0, 1)]))
-            for s in (0, 1):
-                stray[s][fragments[-1][1][s]] = True
+        small = (size > 0) & (size < (size.max() if k else 0.02 * size.max()))
+        fragments += [(k, [rows[s][piece[s] == p] for s in (0, 1)]) for p in np.flatnonzero(small)]
     labels = (owned[0].copy(), owned[1].copy())
-    regret = (np.zeros(len(owned[0])), np.zeros(len(owned[1])))
+    if not fragments:
+        return labels
+    costs, gaps = [], []
     for s in (0, 1):
-        if stray[s].any() and not stray[s].all():
-            points = surfaces[s].points
-            nearest = KDTree(points[~stray[s]]).query(points[stray[s]])[1]
-            labels[s][stray[s]] = owned[s][~stray[s]][nearest]
-            transforms = T_1_0 if s == 0 else [np.linalg.inv(T) for T in T_1_0]
-            costs = label_costs(
-                surfaces[s].rows(np.flatnonzero(stray[s])), surfaces[1 - s].sight, transforms, extent=extent
-            )
-            row = np.arange(len(costs))
-            regret[s][stray[s]] = costs[row, labels[s][stray[s]]] - costs[row, owned[s][stray[s]]]
+        stray = np.zeros(len(owned[s]), bool)
+        stray[np.concatenate([rows[s] for _, rows in fragments])] = True
+        some, points = np.flatnonzero(stray), surfaces[s].points
+        transforms = T_1_0 if s == 0 else [np.linalg.inv(T) for T in T_1_0]
+        cost, gap = (np.full((len(stray), 1 + len(T_1_0)), np.inf) for _ in range(2))
+        cost[some] = label_costs(surfaces[s].rows(some), surfaces[1 - s].sight, transforms, extent=extent)
+        for k in np.unique(owned[s][~stray]):
+            gap[some, k] = KDTree(points[~stray & (owned[s] == k)]).query(points[some])[0]
+        costs.append(cost)
+        gaps.append(gap)
     for k, rows in fragments:
-        if np.concatenate([regret[s][rows[s]] for s in (0, 1)]).mean() > SURE:
+        cost = np.concatenate([costs[s][rows[s]] for s in (0, 1)]).mean(0)
+        gap = np.concatenate([gaps[s][rows[s]] for s in (0, 1)]).min(0)
+        best = int(np.where(gap <= max(TOUCH * extent, gap.min()), cost, np.inf).argmin())
+        if cost[best] - cost[k] < SURE:
             for s in (0, 1):
-                labels[s][rows[s]] = k
+                labels[s][rows[s]] = best
     return labels
 
 

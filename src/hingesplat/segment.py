@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from hingesplat.capture import View
+from hingesplat.drawer import insides
 from hingesplat.gaussians import Gaussians
 from hingesplat.hypotheses import (
     Evidence,
@@ -199,7 +200,8 @@ def segment(
     owned = problem.labels([m.T for m in chosen])
     if parts is None:
         chosen, owned = split_pieces(chosen, owned, surfaces, extent, config.min_part_seeds)
-    owned = reattach_fragments([m.T for m in chosen], owned, surfaces, extent)
+    transforms = [m.T for m in chosen]
+    owned = insides(transforms, reattach_fragments(transforms, owned, surfaces, extent), surfaces, extent)
     costs = costs_of(chosen) if chosen else np.ones((1, 1))
     unexplained = float((costs.min(1) >= config.explained_cost).mean())
     labels = tuple(spread_labels(gaussians[s].means.numpy(), surfaces[s], owned[s]) for s in (0, 1))

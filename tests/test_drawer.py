@@ -1,0 +1,92 @@
+"""A drawer: what one state alone shows of it is its own, and what its cabinet hides goes on as it was last seen."""
+
+import numpy as np
+import pytest
+
+from hingesplat.drawer import drawn_out, insides
+from hingesplat.screw import prismatic, revolute
+from hingesplat.surface import Surface
+from hingesplat.tsdf import DistanceGrid
+from hingesplat.visibility import Sight
+
+OUT = prismatic([0, -1, 0], 0.3)
+"""From state 0, shut, to state 1."""
+
+
+def tray(depth: float) -> np.ndarray:
+    """Points of a drawer, open: its front at y = 0 and its bottom and sides as deep as photographs see."""
+    u = np.linspace(0, 1, 40)
+    a, b = (x.ravel() for x in np.meshgrid(u, u))
+    front = np.stack([0.6 * a - 0.3, 0 * a, 0.24 * b - 0.02], 1)
+    bottom = np.stack([0.5 * a - 0.25, depth * b, 0 * a], 1)
+    sides = [np.stack([0 * a + x, depth * b, 0.2 * a], 1) for x in (-0.25, 0.25)]
+    return np.concatenate([front, bottom, *sides])
+
+
+def surface(points: np.ndarray) -> Surface:
+    nobody = Sight(np.zeros((0, 3, 4)), np.zeros((0, 1, 1), np.float32), np.zeros((0, 1, 1, 3), np.float32), 0.01)
+    return Surface(points, np.full((len(points), 3), 0.5), np.tile([0.0, 0, 1], (len(points), 1)), nobody)
+
+
+@pytest.mark.parametrize("hides", [True, False])
+@pytest.mark.parametrize("T", [OUT, revolute([0, 0, 1], [0.3, 0, 0], 0.5)])
+def test_what_lies_in_a_drawer_is_the_drawers(monkeypatch: pytest.MonkeyPatch, hides: bool, T: np.ndarray) -> None:
+    monkeypatch.setattr("hingesplat.drawer.hidden", lambda some, *_: np.full(len(some.points), hides))
+    u = np.linspace(-0.2, 0.2, 9)
+    a, b = (x.ravel() for x in np.meshgrid(u, u))
+    deep = np.stack([a, 0.4 + 0.2 * b, 0 * a + 0.01], 1)
+    floor, frame = np.stack([a, 0.4 + 0.2 * b, 0 * a - 0.04], 1), np.stack([a, 0 * a + 0.02, 0 * a + 0.26], 1)
+    mine = tray(0.3)
+    there = np.concatenate([mine, deep, floor, frame])
+    here = np.concatenate([mine[:1600] + np.array([0, 0.3, 0]), floor])
+    owned = np.repeat([1, 0], [1600, 81]), np.repeat([1, 0], [len(mine), 243])
+    found = insides([T], owned, (surface(here), surface(there)), 1.0)
+    np.testing.assert_array_equal(found[0], owned[0])
+    expected = owned[1].copy()
+    expected[len(mine) : len(mine) + 81] = hides and T is OUT
+    np.testing.assert_array_equal(found[1], expected)
+
+
+def grid(full: bool = False) -> DistanceGrid:
+    """The same drawer as voxels of 0.01: seen for 0.15, unknown behind."""
+    lower, shape = np.array([-0.35, -0.05, -0.07]), (71, 36, 36)
+    x, y, z = lower[:, None, None, None] + 0.01 * np.indices(shape)
+    front = (np.abs(x) < 0.3) & (np.abs(y) < 0.015) & (z > -0.02) & (z < 0.22)
+    outer = (np.abs(x) < 0.265) & (z > -0.015) & (z < 0.2) & (y > 0) & (y < 0.15)
+    hollow = (np.abs(x) < 0.235) & (z > 0.015) & (not full)
+    solid = front | (outer & ~hollow)
+    return DistanceGrid(lower, 0.01, 0.025, np.where(solid, -1, 1).astype(np.float32), (y < 0.15).astype(np.float32))
+
+
+BACK = np.stack([x.ravel() for x in np.meshgrid(np.linspace(-0.3, 0.3, 31), [0.9], np.linspace(-0.1, 0.3, 21))], 1)
+
+
+def solid_at(found: DistanceGrid, *place: float) -> bool:
+    i = tuple(np.round((np.array(place) - found.lower) / found.voxel).astype(int))
+    inside = all(0 <= a < n for a, n in zip(i, found.distance.shape, strict=True))
+    return inside and bool(found.distance[i] < 0)
+
+
+def test_a_drawer_goes_on_to_the_back_of_its_cabinet() -> None:
+    part = grid()
+    found = drawn_out(part, tray(0.15), BACK, [np.eye(4), OUT], (0.02, 0.04))
+    for y in (0.1, 0.3, 0.6, 0.8):
+        assert solid_at(found, 0, y, 0) and solid_at(found, 0.25, y, 0.1) and solid_at(found, -0.25, y, 0.1)
+        assert not solid_at(found, 0, y, 0.1) and not solid_at(found, 0, y, -0.05) and not solid_at(found, 0.3, y, 0.1)
+    assert solid_at(found, 0, 0.85, 0.1) and not solid_at(found, 0, 0.88, 0.1)
+    # What was seen is what it was.
+    shift = np.round((part.lower - found.lower) / part.voxel).astype(int)
+    window = tuple(slice(a, a + n) for a, n in zip(shift, part.distance.shape, strict=True))
+    np.testing.assert_array_equal(found.distance[window][part.weight > 0], part.distance[part.weight > 0])
+
+
+def test_a_drawer_seen_open_alone_ends_where_it_would_be_when_shut() -> None:
+    found = drawn_out(grid(), tray(0.15), BACK, [np.eye(4), np.linalg.inv(OUT)], (0.02, 0.04))
+    assert solid_at(found, 0, 0.55, 0.1) and not solid_at(found, 0, 0.58, 0.1)
+
+
+@pytest.mark.parametrize("why", ["turns", "stands still", "is full", "nothing is behind"])
+def test_what_is_no_drawer_stays_as_it_is(why: str) -> None:
+    way = {"turns": revolute([0, 0, 1], [0.3, 0, 0], 0.5), "stands still": np.eye(4)}.get(why, OUT)
+    part, back = grid(full=why == "is full"), BACK[:0] if why == "nothing is behind" else BACK
+    assert drawn_out(part, tray(0.15), back, [np.eye(4), way], (0.02, 0.04)) is part
