@@ -90,7 +90,10 @@ def found_with(parts, motions: tuple[Motion, ...], labels: np.ndarray, unexplain
     run = Run(Path(), CAPTURE, replace(ReconstructConfig(), parts=parts), lambda **_: None)
     found = Segmentation((labels, labels), motions, unexplained, 500)
     with caplog.at_level(logging.WARNING, "hingesplat"):
-        return pipeline._without_redundant(run, found, (first, second))
+        T_state_0 = np.stack([np.tile(np.eye(4), (1 + len(motions), 1, 1)), [np.eye(4), *(m.T for m in motions)]])
+        found, T_state_0 = pipeline._without_redundant(run, found, T_state_0, (first, second), 1)
+    assert T_state_0.shape[1] == 1 + len(found.motions)
+    return found
 
 
 def test_the_right_number_of_parts_is_taken_as_it_is(caplog) -> None:
@@ -140,7 +143,7 @@ def test_methods_come_from_fits_to_motions(method, run: Run) -> None:
     run = replace(run, config=replace(config, articulate=articulate, fuse=replace(config.fuse, matched=400)))
     pipeline._segment(run)
     start = load_file(run / "segmentation.safetensors")
-    assert start["T_1_0"].shape == (3, 4, 4)
+    assert start["T_state_0"].shape == (2, 3, 4, 4)
     assert bool(start["labels_0"].any()) == (method == "artgs")
     pipeline._fuse(run)
     pipeline._articulate(run)
@@ -166,13 +169,14 @@ def test_displacements_without_parts_find_a_slide_that_is_plain(run: Run) -> Non
 
 def test_random_motions_can_be_set_on_labels_that_were_found(run: Run, monkeypatch) -> None:
     labels = MADE.gaussians.part.numpy()
-    monkeypatch.setattr(pipeline, "segment", lambda *_, **__: Segmentation((labels, labels.copy()), (UP,), 0.0, 500))
+    found = Segmentation((labels, labels.copy()), (UP,), 0.0, 500), 1, np.stack([[np.eye(4)] * 2, [np.eye(4), UP.T]])
+    monkeypatch.setattr(pipeline, "segment_states", lambda *_, **__: found)
     monkeypatch.setattr(pipeline, "_depth", lambda *_: [])
     run = replace(run, config=replace(ReconstructConfig(), start=StartConfig(motions="random")))
     pipeline._segment(run)
     start = load_file(run / "segmentation.safetensors")
     np.testing.assert_array_equal(start["labels_0"], labels)
-    assert np.abs(start["T_1_0"][1].numpy() - UP.T).max() > 0
+    assert np.abs(start["T_state_0"][1, 1].numpy() - UP.T).max() > 0
 
 
 class Stages:

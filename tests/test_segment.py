@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from hingesplat.gaussians import concatenate
+from hingesplat.gaussians import concatenate, posed
 from hingesplat.hypotheses import PATCH, HypothesesConfig, axis_directions, distinct, groups_to_try, registered
 from hingesplat.labelling import Labelling, label_costs, neighbour_weights, seed_costs, shortest, softmax
 from hingesplat.pieces import reattach_fragments, split_pieces
@@ -16,7 +16,7 @@ from hingesplat.render import render
 from hingesplat.screw import prismatic, revolute
 from hingesplat.se3 import moved
 from hingesplat.search import Motion, inverted
-from hingesplat.segment import SegmentConfig, floating, segment, spread_labels, survey, track
+from hingesplat.segment import SegmentConfig, floating, segment, segment_states, spread_labels, survey, track
 from hingesplat.stereo import Cloud, DepthMap, StereoConfig, depth_map, stereo
 from hingesplat.surface import Surface, bounds, components, surface_of, thin
 from hingesplat.visibility import FREE, HIDDEN, SURFACE, Sight, ask
@@ -616,3 +616,36 @@ def test_tracking_a_part_that_stayed_or_has_no_points_gives_the_identity() -> No
     stayed, absent = track((made.gaussians, made.gaussians), made.views, labels, [PULL, PULL], CONFIG)
     np.testing.assert_allclose(stayed, np.eye(4), atol=1e-3)
     np.testing.assert_array_equal(absent, np.eye(4))
+
+
+def test_a_part_may_rest_in_all_states_but_one() -> None:
+    """A slab before the box slides out in state 2, another behind it in state 1; in state 3 both are halfway."""
+    body = box((-0.5, -0.3, -0.4), (0.5, 0.3, 0.4), 0.03, seed=1)
+    first = box((-0.35, -0.46, -0.3), (0.35, -0.38, 0.3), 0.03, seed=2, part=1)
+    second = box((-0.3, 0.36, -0.25), (0.3, 0.44, 0.25), 0.03, seed=3, part=2)
+    whole = concatenate([body, first, second])
+    cameras = cameras_around(14, 80)
+    ways = {1: (0.3, 0.15), 2: (0.2, 0.1)}
+    values = [(0, 0), (0, ways[2][0]), (ways[1][0], 0), (ways[1][1], ways[2][1])]
+    true = np.stack([[np.eye(4), prismatic(FORWARD, a), prismatic(-FORWARD, b)] for a, b in values])
+    states = [posed(whole, dict(enumerate(T))) for T in true]
+    views = [tuple(photograph(g, c) for c in cameras) for g in states]
+    found, other, T_state_0 = segment_states(states, views, CONFIG)
+    assert len(found.motions) == 2 and other in (2, 3)
+    order = [0] + [1 + int(np.argmin([np.abs(T_state_0[:, 1 + k] - true[:, p]).max() for k in (0, 1)])) for p in (1, 2)]
+    np.testing.assert_allclose(T_state_0[:, order], true, atol=0.03)
+    agree = [(np.array([order.index(p) for p in label]) == whole.part.numpy()).mean() for label in found.labels]
+    assert min(agree) > 0.85  # What no camera sees in a state has no label of its own.
+
+
+def test_states_between_are_not_searched_again_where_all_is_known(monkeypatch) -> None:
+    made = made_scene("prismatic")
+    half = posed(made.gaussians, {1: prismatic(FORWARD, SLIDE / 2)})
+    views = [made.views[0], tuple(photograph(half, v.camera) for v in made.views[0]), made.views[1]]
+    searched = []
+    monkeypatch.setattr(
+        "hingesplat.segment.segment", lambda pair, *a, **k: searched.append(pair) or segment(pair, *a, **k)
+    )
+    found, other, T_state_0 = segment_states([made.gaussians, half, made.at(1)], views, QUICK)
+    assert len(searched) == 1 and other == 2 and len(found.motions) == 1
+    np.testing.assert_allclose(T_state_0[1, 1, :3, 3], FORWARD * SLIDE / 2, atol=0.015)

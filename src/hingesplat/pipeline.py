@@ -50,8 +50,7 @@ from hingesplat.run_folder import (
     versions,
     write_tensors,
 )
-from hingesplat.search import Motion
-from hingesplat.segment import Segmentation, SegmentConfig, segment, track
+from hingesplat.segment import Segmentation, SegmentConfig, segment_states
 from hingesplat.slots import living_slots
 from hingesplat.start import StartConfig, clusters, random_motions
 from hingesplat.stereo import DepthMap, StereoConfig, depth_map, measured, stereo
@@ -300,82 +299,84 @@ def _fit(run: Run) -> None:
 
 
 def _segment(run: Run) -> None:
-    """Parts from the first and the last state: the farther the motion, the plainer."""
-    last = len(run.capture.states) - 1
-    pair = (_fitted(run, 0), _fitted(run, last))
     if run.config.start.labels != "search":
-        return _start_without_search(run, pair)
+        return _start_without_search(run)
+    fitted, seed = [_fitted(run, t) for t in range(len(run.views))], run.config.seed
     parts = None if run.config.parts == "auto" else run.config.parts - 1
-    views, maps = (run.views[0], run.views[last]), (_depth(run, 0), _depth(run, last))
-    found = segment(pair, views, run.config.segment, maps=maps, parts=parts, seed=run.config.seed)
-    _check_explained(run, found, last)
-    found = _without_redundant(run, found, pair)
-    T_1_0 = np.stack([np.eye(4), *(m.T for m in found.motions)])
+    found, other, T_state_0 = segment_states(
+        fitted, run.views, run.config.segment, maps=_depths(run), parts=parts, seed=seed
+    )
+    _check_explained(run, found, other)
+    found, T_state_0 = _without_redundant(run, found, T_state_0, (fitted[0], fitted[other]), other)
     if run.config.start.motions == "random":
-        T_1_0 = random_motions(len(T_1_0), pair[0].means.numpy(), run.config.start.spread, run.config.seed)
-    _write_start(run, found.labels, T_1_0)
+        T_1_0 = random_motions(T_state_0.shape[1], fitted[0].means.numpy(), run.config.start.spread, seed)
+        T_state_0 = initial_transforms(T_1_0, len(fitted))
+    _write_start(run, found.labels, other, T_state_0)
     motions = [{k: np.asarray(v).tolist() for k, v in asdict(m).items()} for m in found.motions]
-    known = {"states": [0, last], "seeds": found.seeds, "unexplained": found.unexplained, "motions": motions}
+    known = {"states": [0, other], "seeds": found.seeds, "unexplained": found.unexplained, "motions": motions}
     write_json(run / "segmentation.json", known)
 
 
-def _start_without_search(run: Run, pair: tuple[Gaussians, Gaussians]) -> None:
+def _start_without_search(run: Run) -> None:
     """Clusters or no labels at all, and random motions, for as many parts as were asked for."""
-    config, parts = run.config.start, run.config.parts
+    config, parts, last = run.config.start, run.config.parts, len(run.views) - 1
     assert parts != "auto"
+    pair = (_fitted(run, 0), _fitted(run, last))
     labels = (np.zeros(len(pair[0]), int), np.zeros(len(pair[1]), int))
     if config.labels == "clusters":
         labels = clusters(pair, parts, config, run.config.seed)
-    _write_start(run, labels, random_motions(parts, pair[0].means.numpy(), config.spread, run.config.seed))
-    write_json(run / "segmentation.json", {"states": [0, len(run.capture.states) - 1], "motions": []})
+    T_1_0 = random_motions(parts, pair[0].means.numpy(), config.spread, run.config.seed)
+    _write_start(run, labels, last, initial_transforms(T_1_0, len(run.views)))
+    write_json(run / "segmentation.json", {"states": [0, last], "motions": []})
 
 
-def _without_redundant(run: Run, found: Segmentation, pair: tuple[Gaussians, Gaussians]) -> Segmentation:
+def _without_redundant(
+    run: Run, found: Segmentation, T_state_0: np.ndarray, pair: tuple[Gaussians, Gaussians], other: int
+) -> tuple[Segmentation, np.ndarray]:
     """A number of parts that was given is an upper bound: what is left over dies, and what is missing is said."""
     wanted = run.config.parts
     if wanted == "auto":
-        return found
-    both = np.concatenate([_posed_back(pair[1], found).means.numpy(), pair[0].means.numpy()])
-    T = np.stack([np.eye(4), *(m.T for m in found.motions)])[None]
+        return found, T_state_0
+    labelled = pair[1].with_part(torch.from_numpy(np.asarray(found.labels[1], np.int64)))
+    back = posed(labelled, {k: np.linalg.inv(T) for k, T in enumerate(T_state_0[other])})
+    both = np.concatenate([back.means.numpy(), pair[0].means.numpy()])
     low, high = np.quantile(both, [0.002, 0.998], axis=0)
     label = np.concatenate([found.labels[1], found.labels[0]])
-    label, living = living_slots(both, label, T, float((high - low).max()), run.config.articulate.slots)
+    slots = run.config.articulate.slots
+    label, living = living_slots(both, label, T_state_0[1:], float((high - low).max()), slots)
     if len(living) < wanted:
         log.warning("parts: %d given, but only %d are seen", wanted, len(living))
     if found.unexplained > PLAIN_UNEXPLAINED:
         log.warning("parts: %d given, but %.0f%% of what moved needs more", wanted, 100 * found.unexplained)
     motions = tuple(found.motions[k - 1] for k in living[1:])
-    return replace(found, labels=(label[len(pair[1]) :], label[: len(pair[1])]), motions=motions)
+    labels = (label[len(pair[1]) :], label[: len(pair[1])])
+    return replace(found, labels=labels, motions=motions), T_state_0[:, living]
 
 
-def _posed_back(second: Gaussians, found: Segmentation) -> Gaussians:
-    """The last state's Gaussians brought to state 0 by the motions found."""
-    labelled = second.with_part(torch.from_numpy(np.asarray(found.labels[1], np.int64)))
-    return posed(labelled, {k + 1: np.linalg.inv(m.T) for k, m in enumerate(found.motions)})
-
-
-def _write_start(run: Run, labels: tuple[np.ndarray, np.ndarray], T_1_0: np.ndarray) -> None:
+def _write_start(run: Run, labels: tuple[np.ndarray, np.ndarray], other: int, T_state_0: np.ndarray) -> None:
+    """Labels of the Gaussians of state 0 and of the state ``other``, and where every part is in each state."""
     found = {f"labels_{s}": torch.from_numpy(np.asarray(labels[s], np.int64)) for s in (0, 1)}
-    write_tensors(run / "segmentation.safetensors", found | {"T_1_0": torch.from_numpy(T_1_0)})
+    found |= {"other": torch.tensor(other), "T_state_0": torch.from_numpy(T_state_0)}
+    write_tensors(run / "segmentation.safetensors", found)
 
 
 def _fuse(run: Run) -> None:
     found = load_file(run / "segmentation.safetensors")
-    last = len(run.capture.states) - 1
-    if len(found["T_1_0"]) == 1:  # Nothing moved: the first state is all there is.
+    T_state_0, other = found["T_state_0"].numpy(), int(found["other"])
+    if T_state_0.shape[1] == 1:  # Nothing moved: the first state is all there is.
         canonical = _fitted(run, 0)
     else:
         labels = (found["labels_0"].numpy(), found["labels_1"].numpy())
-        pair = (_fitted(run, 0), _fitted(run, last))
-        canonical = fuse(pair, labels, found["T_1_0"].numpy(), run.config.fuse, seed=run.config.seed)
+        pair = (_fitted(run, 0), _fitted(run, other))
+        canonical = fuse(pair, labels, T_state_0[other], run.config.fuse, seed=run.config.seed)
     canonical.save(run / "canonical.safetensors")
 
 
 def initial_transforms(T_1_0: np.ndarray, states: int) -> np.ndarray:
-    """T_state_0 (states, parts, 4, 4) to start from.
+    """T_state_0 (states, parts, 4, 4) to start from where no motion is known but that of the last state.
 
-    ``T_1_0`` (parts, 4, 4) are the motions from the first state to the last, the identity for the base.
-    States between the two are at state 0 until ``track`` has found them.
+    ``T_1_0`` (parts, 4, 4) are the motions from the first state to the last, the identity for the base. The states
+    between are left to the optimisation.
     """
     T_state_0 = np.tile(np.eye(4), (states, len(T_1_0), 1, 1))
     T_state_0[-1] = T_1_0
@@ -384,25 +385,13 @@ def initial_transforms(T_1_0: np.ndarray, states: int) -> np.ndarray:
 
 def _articulate(run: Run) -> None:
     canonical = Gaussians.load(run / "canonical.safetensors")
-    T_1_0 = load_file(run / "segmentation.safetensors")["T_1_0"].numpy()
-    T_state_0 = initial_transforms(T_1_0, len(run.capture.states))
-    fitted = [_fitted(run, t) for t in range(len(T_state_0))]
-    if len(T_1_0) > 1:
-        labels = load_file(run / "segmentation.safetensors")["labels_0"].numpy()
-        motions = [Motion.of(m) for m in read_json(run / "segmentation.json")["motions"]]
-        # A start without motions leaves the states between to the optimisation.
-        for t in range(1, len(T_state_0) - 1 if motions else 1):
-            pair, views = (fitted[0], fitted[t]), (run.views[0], run.views[t])
-            maps = (_depth(run, 0), _depth(run, t))
-            T_state_0[t, 1:] = track(pair, views, labels, motions, run.config.segment, maps=maps, seed=run.config.seed)
-    if len(T_1_0) == 1:
-        moved = Articulation(canonical, T_state_0, torch.zeros(len(T_state_0), len(canonical), 3))
-    else:
-        config, report = run.config.articulate, run.reporting("articulate")
-        seed = run.config.seed
+    T_state_0 = load_file(run / "segmentation.safetensors")["T_state_0"].numpy()
+    moved = Articulation(canonical, T_state_0, torch.zeros(len(T_state_0), len(canonical), 3))
+    if T_state_0.shape[1] > 1:
         moved = articulate(
-            canonical, T_state_0, run.views, config,
-            fitted=fitted, maps=_depths(run), seed=seed, device=run.device, report=report,
+            canonical, T_state_0, run.views, run.config.articulate,
+            fitted=[_fitted(run, t) for t in range(len(T_state_0))], maps=_depths(run),
+            seed=run.config.seed, device=run.device, report=run.reporting("articulate"),
         )  # fmt: skip
     extra = {"T_state_0": torch.from_numpy(np.asarray(moved.T_state_0)), "state_sh": moved.state_sh}
     write_tensors(run / "articulation.safetensors", vars(moved.gaussians) | extra)

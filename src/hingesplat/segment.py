@@ -8,6 +8,7 @@ the place where its label says it went; Gaussians take that of the nearest point
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -27,6 +28,7 @@ from hingesplat.hypotheses import (
 )
 from hingesplat.labelling import Labelling, seed_costs
 from hingesplat.pieces import reattach_fragments, split_pieces
+from hingesplat.se3 import moved
 from hingesplat.search import BASE, Motion, ScoreVolume, carrier_of, inverted, novelty, scan, score_volume
 from hingesplat.stereo import DepthMap
 from hingesplat.surface import Surface, bounds, surface_of, thin
@@ -57,6 +59,8 @@ class SegmentConfig:
     """The same where something is left that no joint on the base explains: parts that hang on others are small."""
     min_part_seeds: int = 25
     """A part must own at least this many seeds."""
+    min_left_over: int = 100
+    """Seeds that no part known explains from which a further state is searched for more parts."""
     hypotheses: HypothesesConfig = field(default_factory=HypothesesConfig)
     rounds: int = 3
     """Rounds of relabelling and refining the motions."""
@@ -64,10 +68,10 @@ class SegmentConfig:
 
 @dataclass(frozen=True)
 class Segmentation:
-    """Parts found: part k + 1 moves by ``motions[k]`` from state 0 to the other state."""
+    """Parts found: part k + 1 moves by ``motions[k]`` from state 0 to the other state, or to one where it does move."""
 
     labels: tuple[np.ndarray, np.ndarray]
-    """Part id of every Gaussian of the two states."""
+    """Part id of every Gaussian of state 0 and of the other state."""
     motions: tuple[Motion, ...]
     unexplained: float
     """Fraction of the seeds that no motion explains."""
@@ -208,6 +212,110 @@ def segment(
     return Segmentation((labels[0], labels[1]), tuple(chosen), unexplained, n_seeds)
 
 
+def segment_states(
+    gaussians: Sequence[Gaussians],
+    views: Sequence[Sequence[View]],
+    config: SegmentConfig,
+    *,
+    maps: Sequence[Sequence[DepthMap]] = (),
+    parts: int | None = None,
+    seed: int = 0,
+) -> tuple[Segmentation, int, np.ndarray]:
+    """Parts of an object in two or more states, wherever they move.
+
+    The state in which most has moved since state 0 comes first. Then each of the others is searched, if more moves in
+    it than the parts known so far explain: a part may rest in all states but one.
+
+    Args:
+        gaussians: fitted to every state.
+        views: the training photographs of every state.
+        maps: the depth of these photographs where it is known.
+        parts: number of movable parts, or None to find it.
+
+    Returns:
+        The parts, with labels of state 0 and of that other state; the number of that state; and where each part is in
+        every state, T_state_0 (states, 1 + parts, 4, 4), the base first.
+    """
+    maps = maps or [()] * len(views)
+
+    def beside(t: int) -> tuple[tuple[Gaussians, Gaussians], tuple[Sequence[View], Sequence[View]]]:
+        return (gaussians[0], gaussians[t]), (views[0], views[t])
+
+    def more(t: int) -> dict[str, Any]:
+        return {"maps": (maps[0], maps[t]), "seed": seed}
+
+    others, moving = list(range(1, len(gaussians))), {}
+    if len(others) > 1:
+        moving = {t: _moving(*beside(t), config, **more(t)) for t in others}
+        others.sort(key=lambda t: -sum(map(len, moving[t][1])))
+    most = others[0]
+    found = segment(*beside(most), config, parts=parts, **more(most))
+    place = {(most, k): motion.T for k, motion in enumerate(found.motions)}
+    for t in others[1:]:
+        known = track(*beside(t), found.labels[0], found.motions, config, **more(t))
+        place |= {(t, k): T for k, T in enumerate(known)}
+        room = None if parts is None else parts - len(found.motions)
+        if room == 0 or _left_over(gaussians[0], found.labels[0], known, moving[t]) < config.min_left_over:
+            continue
+        here = segment(*beside(t), config, **more(t))
+        for k, motion in enumerate(here.motions[:room]):
+            mine = here.labels[0] == k + 1
+            new = mine & (found.labels[0] == 0)
+            if 2 * new.sum() > mine.sum():
+                place[t, len(found.motions)] = motion.T
+                found = _with_part(found, motion, new, (gaussians[0], gaussians[most]))
+    T_state_0 = np.tile(np.eye(4), (len(gaussians), 1 + len(found.motions), 1, 1))
+    for t in others:
+        if any((t, k) not in place for k in range(len(found.motions))):
+            late = track(*beside(t), found.labels[0], found.motions, config, **more(t))
+            place = {(t, k): T for k, T in enumerate(late)} | place
+        for k in range(len(found.motions)):
+            T_state_0[t, 1 + k] = place[t, k]
+    return found, most, T_state_0
+
+
+def _moving(
+    gaussians: tuple[Gaussians, Gaussians],
+    views: tuple[Sequence[View], Sequence[View]],
+    config: SegmentConfig,
+    *,
+    maps: tuple[Sequence[DepthMap], Sequence[DepthMap]],
+    seed: int,
+) -> tuple[float, list[np.ndarray]]:
+    """The extent of two states, and each state's points (n, 3), thinned, that must have moved."""
+    rng = np.random.default_rng(seed)
+    low, high, surfaces = survey(gaussians, views, maps, config)
+    extent, points = float((high - low).max()), []
+    for surface, other in (surfaces, surfaces[::-1]):
+        some = surface.points[floating(ask(surface.points, surface.colours, other.sight))]
+        points.append(some[thin(some, 0.012 * extent, rng)])
+    return extent, points
+
+
+def _left_over(
+    gaussians: Gaussians, labels: np.ndarray, T_t_0: Sequence[np.ndarray], moving: tuple[float, list[np.ndarray]]
+) -> int:
+    """How many of the points that must have moved belong to none of the parts known, in either state."""
+    extent, (here, there) = moving
+    means = gaussians.means.numpy()
+    at_end = np.concatenate([means[:0], *(moved(means[labels == k], T) for k, T in enumerate(T_t_0, 1))])
+    count = int((labels[KDTree(means).query(here)[1]] == 0).sum()) if len(here) else 0
+    if len(at_end) == 0 or len(there) == 0:
+        return count + len(there)
+    return count + int((KDTree(at_end).query(there)[0] > 0.03 * extent).sum())
+
+
+def _with_part(
+    found: Segmentation, motion: Motion, rows: np.ndarray, gaussians: tuple[Gaussians, Gaussians]
+) -> Segmentation:
+    """One part more, that of ``rows`` (n,) bool of state 0's Gaussians; in the other state of ``found`` it rests."""
+    here, there = (g.means.numpy() for g in gaussians)
+    part, labels = len(found.motions) + 1, (found.labels[0].copy(), found.labels[1].copy())
+    labels[0][rows] = part
+    labels[1][(labels[1] == 0) & rows[KDTree(here).query(there)[1]]] = part
+    return replace(found, labels=labels, motions=(*found.motions, motion))
+
+
 def track(
     gaussians: tuple[Gaussians, Gaussians],
     views: tuple[Sequence[View], Sequence[View]],
@@ -263,4 +371,4 @@ def spread_labels(points: np.ndarray, surface: Surface, labels: np.ndarray) -> n
     return labels[KDTree(surface.points).query(points)[1]]
 
 
-__all__ = ["SegmentConfig", "Segmentation", "segment", "track"]
+__all__ = ["SegmentConfig", "Segmentation", "segment", "segment_states", "track"]
