@@ -90,3 +90,18 @@ def test_what_is_no_drawer_stays_as_it_is(why: str) -> None:
     way = {"turns": revolute([0, 0, 1], [0.3, 0, 0], 0.5), "stands still": np.eye(4)}.get(why, OUT)
     part, back = grid(full=why == "is full"), BACK[:0] if why == "nothing is behind" else BACK
     assert drawn_out(part, tray(0.15), back, [np.eye(4), way], (0.02, 0.04)) is part
+
+
+def test_a_drawer_whose_back_was_seen_ends_there() -> None:
+    u = np.linspace(-0.23, 0.23, 30)
+    back = np.stack([u, 0 * u + 0.3, 0 * u + 0.06], 1)
+    found = drawn_out(grid(), np.concatenate([tray(0.15), back]), BACK, [np.eye(4), OUT], (0.02, 0.04))
+    assert solid_at(found, 0, 0.31, 0.1) and not solid_at(found, 0, 0.35, 0)
+    narrow = np.concatenate([tray(0.15), back[12:18], back[12:18]])  # Something in it.
+    assert solid_at(drawn_out(grid(), narrow, BACK, [np.eye(4), OUT], (0.02, 0.04)), 0, 0.6, 0)
+
+
+def test_a_flat_part_has_no_section() -> None:
+    plate = tray(0.15)[:1600]
+    part = grid()
+    assert drawn_out(part, plate, BACK, [np.eye(4), prismatic([1, 0, 0], 0.3)], (0.02, 0.04)) is part

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 from scipy import ndimage
-from scipy.spatial import Delaunay, QhullError
+from scipy.spatial import ConvexHull, Delaunay, KDTree
 
 from hingesplat.labelling import hidden
 from hingesplat.se3 import moved
@@ -20,6 +20,8 @@ SEEN = 0.5
 """Share of a cross-section that must have been seen, of what its outline holds."""
 FULL = 0.6
 """Share of it that is solid in a block, a panel, or a drawer whose back was seen: these end where they end."""
+INNER = 0.8
+"""Share of an outline's width and height that its walls leave."""
 STRAY = 0.02
 """Share of a surface that may lie deeper than its last cross-section."""
 NARROW = 0.08
@@ -50,7 +52,7 @@ def insides(T_1_0: Sequence[np.ndarray], owned: Labels, surfaces: tuple[Surface,
             box = _largest(mine[depth > (near + far) / 2], 0.03 * extent) @ across.T
             if len(box) < FEWEST or _narrowest(box) < NARROW * extent:
                 continue
-            outline = Delaunay(box)
+            outline = _outline(box)
             for s, T_s in ((0, T), (1, np.linalg.inv(T))):
                 at_end = surfaces[s].points if s == 1 else moved(surfaces[s].points, T)
                 inner = np.flatnonzero((owned[s] == 0) & (at_end @ inwards > near + (far - near) / 4))
@@ -80,24 +82,30 @@ def drawn_out(
     axis = _slide(T_base_part)
     if axis is None:
         return part
-    ways, front = np.array([T[:3, 3] for T in T_base_part]), _largest(surface, 4 * part.voxel)
+    ways, front = np.array([T[:3, 3] for T in T_base_part]), _largest(surface, 2 * own)
     for inwards in (axis, -axis):
         across = _across(inwards)
-        covered = Delaunay(front @ across.T)  # A drawer's box is behind its front.
+        if len(front) < FEWEST or _narrowest(front @ across.T) < own:
+            continue
+        covered = _outline(front @ across.T)  # A drawer's box is behind its front.
         box = surface[covered.find_simplex(surface @ across.T) >= 0]
-        found = _section(part, box, inwards, 3 * own)
+        found = _section(part, box, inwards, own)
         if found is None:
             continue
         start, outline = found
         farthest = float((ways @ inwards).max())
-        behind = base[base @ inwards > start + farthest + wall]
-        # The inner nine tenths: frames and rails beside the way are not its end.
-        middle = outline.points.mean(0)
-        back = behind[outline.find_simplex(middle + (behind @ across.T - middle) / 0.9) >= 0] @ inwards
-        if len(back) >= FEWEST:
-            end = float(np.median(back)) - farthest - wall
-            if end > start + 2 * own:
-                part = _extruded(part, inwards, (start, end), (covered, outline), own)
+        behind = _within(base, outline, inwards, start + farthest + wall) @ inwards
+        if len(behind) < FEWEST:
+            continue
+        end = float(np.median(behind)) - farthest - wall
+        inside = _within(box, outline, inwards, start)
+        if len(inside) >= FEWEST:
+            back = float(np.median(inside @ inwards))
+            face = inside[np.abs(inside @ inwards - back) < own] @ across.T
+            if np.ptp(face, axis=0).max() > INNER**2 * np.ptp(outline.points, axis=0).max():  # From wall to wall.
+                end = min(end, back + own)
+        if end > start + 2 * own:
+            part = _extruded(part, box, inwards, (start, end), covered, own)
     return part
 
 
@@ -121,6 +129,18 @@ def _narrowest(flat: np.ndarray) -> float:
     return float(np.ptp(np.linalg.svd(flat - flat.mean(0), full_matrices=False)[2] @ flat.T, axis=1).min())
 
 
+def _outline(flat: np.ndarray) -> Delaunay:
+    """The convex hull of points (n, 2), which tells what lies in it."""
+    return Delaunay(flat[ConvexHull(flat).vertices])
+
+
+def _within(points: np.ndarray, outline: Delaunay, inwards: np.ndarray, start: float) -> np.ndarray:
+    """The points (n, 3) behind a cross-section that lie well inside its outline: walls and rails do not."""
+    points = points[points @ inwards > start]
+    middle = (outline.points.min(0) + outline.points.max(0)) / 2
+    return points[outline.find_simplex(middle + (points @ _across(inwards).T - middle) / INNER) >= 0]
+
+
 def _across(axis: np.ndarray) -> np.ndarray:
     """(2, 3) unit vectors across an axis."""
     u = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
@@ -134,56 +154,66 @@ def _places(grid: DistanceGrid) -> np.ndarray:
 
 
 def _section(
-    part: DistanceGrid, surface: np.ndarray, inwards: np.ndarray, narrowest: float
+    part: DistanceGrid, surface: np.ndarray, inwards: np.ndarray, wall: float
 ) -> tuple[float, Delaunay] | None:
-    """Where, along ``inwards``, the last cross-section lies that was well seen, and its outline.
+    """Where, along ``inwards``, the last cross-section lies that was well seen, and its outline; None if it is full.
 
-    None if it is full, or narrower than ``narrowest``.
+    A slice is as thick as a ``wall``, for one voxel alone has gaps, and what is narrower than three is no section.
     """
     places, across = _places(part), _across(inwards)
-    slab, slab_of_surface = (np.floor((p @ inwards) / part.voxel).astype(int) for p in (places, surface))
+    depth, depth_of_surface = places @ inwards, surface @ inwards
     seen, solid = (part.weight > 0).ravel(), (part.distance < 0).ravel()
-    for k in range(int(np.quantile(slab_of_surface, 1 - STRAY)), int(slab_of_surface.min()), -1):
-        edge = surface[np.abs(slab_of_surface - k) <= 1] @ across.T  # One voxel alone has gaps.
-        try:
-            outline = Delaunay(edge)
-        except (QhullError, ValueError):  # Too few points, or all on a line.
+    deepest, first = np.quantile(depth_of_surface, [1 - STRAY, 0])
+    for at in np.arange(deepest, first, -part.voxel):
+        edge = surface[np.abs(depth_of_surface - at) < wall / 2] @ across.T
+        if len(edge) < FEWEST or _narrowest(edge) < 3 * wall:
             continue
-        rows = np.flatnonzero(slab == k)
+        outline = _outline(edge)
+        rows = np.flatnonzero(np.abs(depth - at) < part.voxel / 2)
         rows = rows[outline.find_simplex(places[rows] @ across.T) >= 0]
-        if min(len(edge), len(rows)) < FEWEST or seen[rows].mean() < SEEN:
-            continue
-        hollow = solid[rows].mean() < FULL and _narrowest(edge) > narrowest
-        return ((k + 0.5) * part.voxel, outline) if hollow else None
+        if len(rows) and seen[rows].mean() > SEEN:
+            return None if solid[rows].mean() > FULL else (float(at), outline)
     return None
 
 
 def _extruded(
     part: DistanceGrid,
+    surface: np.ndarray,
     inwards: np.ndarray,
     span: tuple[float, float],
-    outlines: tuple[Delaunay, Delaunay],
+    covered: Delaunay,
     wall: float,
 ) -> DistanceGrid:
     """Unseen voxels of a span along ``inwards`` as they are at its start, and a back before its end.
 
-    ``outlines``, across, are those of all that goes on and of the back. A little before the start is mended likewise.
+    All that behind the front, whose outline across is ``covered``. A little before the start is mended likewise.
     """
     (start, end), across = span, _across(inwards)
+    # Not what only closes pockets.
+    places, known = _places(part), part.distance.copy()
+    close = np.flatnonzero((np.abs(places @ inwards - start) < wall + part.voxel) & (part.weight == 0).ravel())
+    far = np.isinf(KDTree(surface).query(places[close], distance_upper_bound=wall)[0])
+    known.ravel()[close[far]] = 1
     grid = _longer(part, (end - start + 3 * part.voxel) * inwards)
     places = _places(grid)
-    rows = np.flatnonzero((places @ inwards > start - 2 * wall) & (grid.weight.ravel() == 0))
-    covered, inside = (outline.find_simplex(places[rows] @ across.T) >= 0 for outline in outlines)
+    rows = np.flatnonzero((places @ inwards > start - wall) & (grid.weight.ravel() == 0))
+    rows = rows[covered.find_simplex(places[rows] @ across.T) >= 0]
     places, along = places[rows], places[rows] @ inwards
     distance = grid.distance.ravel().copy()
     guess = np.where(along < start, distance[rows], 1)
-    for before in np.arange(0, 2 * wall, part.voxel):  # One section alone has gaps.
+    for before in np.arange(0, wall, part.voxel):  # One section alone has gaps.
         at_start = (places - (along - start + before)[:, None] * inwards - part.lower) / part.voxel
-        guess = np.minimum(guess, ndimage.map_coordinates(part.distance, at_start.T, order=1, cval=1.0))
-    back = np.where(inside, np.abs(along - (end - wall / 2)) - wall / 2, np.inf) / part.truncation
-    guess = np.where(covered, np.minimum(guess, back), 1)
-    guess = np.where(along < end, guess, np.maximum(guess, (along - end) / part.truncation))
-    distance[rows] = np.clip(guess, -1, 1)
+        walls = ndimage.map_coordinates(known, at_start.T, order=1, cval=1.0)
+        if (walls < 0).mean() > FULL:
+            break  # The front.
+        guess = np.minimum(guess, walls)
+    solid = places[guess < 0] @ across.T
+    if len(solid) < FEWEST or _narrowest(solid) < part.voxel:
+        return part
+    outline = _outline(solid)
+    back = np.abs(along - (end - wall / 2)) - wall / 2
+    back = np.where(outline.find_simplex(places @ across.T) >= 0, back / part.truncation, 1)
+    distance[rows] = np.clip(np.where(along < end, np.minimum(guess, back), (along - end) / part.truncation), -1, 1)
     return replace(grid, distance=distance.reshape(grid.distance.shape))
 
 
