@@ -164,7 +164,7 @@ class Labelling:
         Args:
             T_1_0: motions to choose from.
             part_cost: the price of each.
-            parts: choose this many instead, as far as there are.
+            parts: choose no more than this many.
 
         Returns:
             The indices of the motions chosen, and labels that count them from 1.
@@ -178,7 +178,8 @@ class Labelling:
         def solved(kept: frozenset[int]) -> tuple[Labels, float]:
             columns = [0, *sorted(kept)]
             (first, second), energy = solve(columns, 8)
-            price = part_cost * len(kept) if parts is None else sum(map(len, costs)) * abs(len(kept) - parts)
+            too_many = 0 if parts is None else max(len(kept) - parts, 0)
+            price = part_cost * len(kept) + sum(map(len, costs)) * too_many
             return (np.array(columns)[first], np.array(columns)[second]), energy + price
 
         kept = shortest(

@@ -149,7 +149,7 @@ def segment(
         gaussians: fitted to state 0 and to the other state.
         views: the training photographs of the same two states.
         maps: the depth of these photographs where it is known.
-        parts: number of movable parts, or None to find it.
+        parts: number of movable parts at most, or None to find it.
     """
     rng = np.random.default_rng(seed)
     low, high, surfaces = survey(gaussians, views, maps, config)
@@ -202,8 +202,9 @@ def segment(
             chosen = more
     problem = Labelling.of(surfaces, extent)
     owned = problem.labels([m.T for m in chosen])
-    if parts is None:
-        chosen, owned = split_pieces(chosen, owned, surfaces, extent, config.min_part_seeds)
+    pieces = split_pieces(chosen, owned, surfaces, extent, config.min_part_seeds)
+    if parts is None or len(pieces[0]) <= parts:
+        chosen, owned = pieces
     transforms = [m.T for m in chosen]
     owned = insides(transforms, reattach_fragments(transforms, owned, surfaces, extent), surfaces, extent)
     costs = costs_of(chosen) if chosen else np.ones((1, 1))
@@ -230,7 +231,7 @@ def segment_states(
         gaussians: fitted to every state.
         views: the training photographs of every state.
         maps: the depth of these photographs where it is known.
-        parts: number of movable parts, or None to find it.
+        parts: number of movable parts at most, or None to find it.
 
     Returns:
         The parts, with labels of state 0 and of that other state; the number of that state; and where each part is in
