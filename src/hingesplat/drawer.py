@@ -22,6 +22,8 @@ FULL = 0.6
 """Share of it that is solid in a block, a panel, or a drawer whose back was seen: these end where they end."""
 INNER = 0.8
 """Share of an outline's width and height that its walls leave."""
+SPAN = 0.5
+"""Share of an outline's width that a back spans; what spans less is something in the drawer."""
 STRAY = 0.02
 """Share of a surface that may lie deeper than its last cross-section."""
 NARROW = 0.08
@@ -94,15 +96,16 @@ def drawn_out(
             continue
         start, outline = found
         farthest = float((ways @ inwards).max())
-        behind = _within(base, outline, inwards, start + farthest + wall) @ inwards
+        behind = base[base @ inwards > start + farthest + wall]
+        behind = behind[_inner(outline, behind @ across.T)] @ inwards
         if len(behind) < FEWEST:
             continue
         end = float(np.median(behind)) - farthest - wall
-        inside = _within(box, outline, inwards, start)
+        inside = box[(box @ inwards > start) & _inner(outline, box @ across.T)]
         if len(inside) >= FEWEST:
             back = float(np.median(inside @ inwards))
             face = inside[np.abs(inside @ inwards - back) < own] @ across.T
-            if np.ptp(face, axis=0).max() > INNER**2 * np.ptp(outline.points, axis=0).max():  # From wall to wall.
+            if np.ptp(face, axis=0).max() > SPAN * np.ptp(outline.points, axis=0).max():
                 end = min(end, back + own)
         if end > start + 2 * own:
             part = _extruded(part, box, inwards, (start, end), covered, own)
@@ -134,11 +137,10 @@ def _outline(flat: np.ndarray) -> Delaunay:
     return Delaunay(flat[ConvexHull(flat).vertices])
 
 
-def _within(points: np.ndarray, outline: Delaunay, inwards: np.ndarray, start: float) -> np.ndarray:
-    """The points (n, 3) behind a cross-section that lie well inside its outline: walls and rails do not."""
-    points = points[points @ inwards > start]
+def _inner(outline: Delaunay, flat: np.ndarray) -> np.ndarray:
+    """(n,) bool: points (n, 2) that lie well inside an outline: walls and rails do not."""
     middle = (outline.points.min(0) + outline.points.max(0)) / 2
-    return points[outline.find_simplex(middle + (points @ _across(inwards).T - middle) / INNER) >= 0]
+    return outline.find_simplex(middle + (flat - middle) / INNER) >= 0
 
 
 def _across(axis: np.ndarray) -> np.ndarray:
@@ -199,21 +201,23 @@ def _extruded(
     rows = np.flatnonzero((places @ inwards > start - wall) & (grid.weight.ravel() == 0))
     rows = rows[covered.find_simplex(places[rows] @ across.T) >= 0]
     places, along = places[rows], places[rows] @ inwards
-    distance = grid.distance.ravel().copy()
-    guess = np.where(along < start, distance[rows], 1)
+    profile = np.ones(len(rows))
     for before in np.arange(0, wall, part.voxel):  # One section alone has gaps.
         at_start = (places - (along - start + before)[:, None] * inwards - part.lower) / part.voxel
         walls = ndimage.map_coordinates(known, at_start.T, order=1, cval=1.0)
         if (walls < 0).mean() > FULL:
             break  # The front.
-        guess = np.minimum(guess, walls)
-    solid = places[guess < 0] @ across.T
-    if len(solid) < FEWEST or _narrowest(solid) < part.voxel:
+        profile = np.minimum(profile, walls)
+    flat = places @ across.T
+    if (profile < 0).sum() < FEWEST or _narrowest(flat[profile < 0]) < part.voxel:
         return part
-    outline = _outline(solid)
+    outline = _outline(flat[profile < 0])
+    profile[_inner(outline, flat)] = 1  # What lies in a drawer does not go on.
     back = np.abs(along - (end - wall / 2)) - wall / 2
-    back = np.where(outline.find_simplex(places @ across.T) >= 0, back / part.truncation, 1)
-    distance[rows] = np.clip(np.where(along < end, np.minimum(guess, back), (along - end) / part.truncation), -1, 1)
+    back = np.where(outline.find_simplex(flat) >= 0, back / part.truncation, 1)
+    distance = grid.distance.ravel().copy()
+    guess = np.minimum(profile, np.where(along < start, distance[rows], back))
+    distance[rows] = np.clip(np.where(along < end, guess, (along - end) / part.truncation), -1, 1)
     return replace(grid, distance=distance.reshape(grid.distance.shape))
 
 
