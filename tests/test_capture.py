@@ -594,7 +594,7 @@ BAD = {
     ),
     "broken json": (
         write('{"frames": [,]}'),
-        r"state1/transforms_train.json: broken JSON at line 1, column 13",
+        r"state1/transforms_train.json: not valid JSON \(line 1, column 13",
     ),
     "json is a list": (write("[]"), "must hold a JSON object, not a list"),
     "no frames": (drop("frames"), r'state1/transforms_train.json: lacks the key "frames"'),

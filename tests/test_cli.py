@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from rich.console import Console
 from safetensors import SafetensorError
 
 import hingesplat
 from hingesplat import cli, pipeline
+from hingesplat.console import StageProgress, show_metrics
 from hingesplat.gaussians import Gaussians
 from hingesplat.pipeline import ReconstructConfig, Run, preset
 from hingesplat.twin import Joint, JointStd, Part, Twin
@@ -262,14 +264,14 @@ def test_metrics_table_shows_what_was_missed(capfd) -> None:
         "views": {"psnr": None, "ssim": None, "why_null": "no photographs"},
         "part_iou": None,
     }
-    cli.show_metrics(cli.Console(width=120), metrics)
+    show_metrics(Console(width=120), metrics)
     out = capfd.readouterr().out
     assert "missed" in out and "90.000" in out and "no photographs" in out
 
 
 def test_progress_shows_step_loss_and_time(capfd) -> None:
-    console = cli.Console(force_terminal=True, width=120)
-    with cli.StageProgress(console) as report:
+    console = Console(force_terminal=True, width=120)
+    with StageProgress(console) as report:
         report(stage="stereo")
         report(stage="stereo", state=0, step=1, steps=2)
         report(stage="fit")

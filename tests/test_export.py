@@ -13,10 +13,12 @@ import torch
 import trimesh
 from lxml import etree
 from PIL import Image
+from rich.console import Console
 from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
 
 from hingesplat import cli
+from hingesplat.console import show_check
 from hingesplat.errors import HingesplatError
 from hingesplat.export import FORMATS, ExportConfig, export_twin
 from hingesplat.export.check import Check, check_export, simulation, sweep
@@ -576,8 +578,8 @@ def test_a_mesh_that_cannot_be_closed_is_named_and_the_export_goes_on(cabinet: M
 
 
 def test_a_check_that_fails_is_heard(capfd):
-    cli.show_check(cli.Console(), "mjcf", Check("MuJoCo 0", 2, 31.4, ("base and door",)))
-    cli.show_check(cli.Console(), "usd", Check("UsdValidation 0", 2, warnings=("no root",)))
+    show_check(Console(), "mjcf", Check("MuJoCo 0", 2, 31.4, ("base and door",)))
+    show_check(Console(), "usd", Check("UsdValidation 0", 2, warnings=("no root",)))
     out, err = capfd.readouterr()
     assert "contacts: base and door" in out and "warnings: 1" in out
     assert "misses its end by 31 %" in err and "usd in UsdValidation 0: no root" in err
@@ -762,7 +764,7 @@ def test_parts_that_pass_through_each_other_are_named_by_the_check(tmp_path: Pat
     path = export(made, tmp_path, "mjcf", tmp_path)
     (check,) = check_export("mjcf", path)
     assert check.ok and check.contacts == () and check.ignored == ("p1 and p2",)
-    cli.show_check(cli.Console(), "mjcf", check)
+    show_check(Console(), "mjcf", check)
     assert "may pass through each other, as their meshes meet: p1 and p2" in " ".join(capfd.readouterr().out.split())
     root = etree.parse(path)
     for exclude in root.findall("contact/exclude"):

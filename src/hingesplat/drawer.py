@@ -12,6 +12,7 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, Delaunay, KDTree
 
 from hingesplat.labelling import hidden
+from hingesplat.screw import axes_across
 from hingesplat.se3 import moved
 from hingesplat.surface import Labels, Surface, components
 from hingesplat.tsdf import DistanceGrid
@@ -49,7 +50,7 @@ def insides(T_1_0: Sequence[np.ndarray], owned: Labels, surfaces: tuple[Surface,
             continue
         mine = np.concatenate([moved(surfaces[0].points[owned[0] == k], T), surfaces[1].points[owned[1] == k]])
         for inwards in (axis, -axis):
-            across, depth = _across(inwards), mine @ inwards
+            across, depth = axes_across(inwards), mine @ inwards
             near, far = np.quantile(depth, [STRAY, 1 - STRAY]) if len(mine) else (0, 0)
             box = _largest(mine[depth > (near + far) / 2], 0.03 * extent) @ across.T
             if len(box) < FEWEST or _narrowest(box) < NARROW * extent:
@@ -86,7 +87,7 @@ def drawn_out(
         return part
     ways, front = np.array([T[:3, 3] for T in T_base_part]), _largest(surface, 2 * own)
     for inwards in (axis, -axis):
-        across = _across(inwards)
+        across = axes_across(inwards)
         if len(front) < FEWEST or _narrowest(front @ across.T) < own:
             continue
         covered = _outline(front @ across.T)  # A drawer's box is behind its front.
@@ -143,13 +144,6 @@ def _inner(outline: Delaunay, flat: np.ndarray) -> np.ndarray:
     return outline.find_simplex(middle + (flat - middle) / INNER) >= 0
 
 
-def _across(axis: np.ndarray) -> np.ndarray:
-    """(2, 3) unit vectors across an axis."""
-    u = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-    u /= np.linalg.norm(u)
-    return np.stack([u, np.cross(axis, u)])
-
-
 def _places(grid: DistanceGrid) -> np.ndarray:
     """(voxels, 3) centres, in the order of a raveled grid."""
     return grid.lower + grid.voxel * np.indices(grid.distance.shape).reshape(3, -1).T
@@ -162,7 +156,7 @@ def _section(
 
     A slice is as thick as a ``wall``, for one voxel alone has gaps, and what is narrower than three is no section.
     """
-    places, across = _places(part), _across(inwards)
+    places, across = _places(part), axes_across(inwards)
     depth, depth_of_surface = places @ inwards, surface @ inwards
     seen, solid = (part.weight > 0).ravel(), (part.distance < 0).ravel()
     deepest, first = np.quantile(depth_of_surface, [1 - STRAY, 0])
@@ -190,7 +184,7 @@ def _extruded(
 
     All that behind the front, whose outline across is ``covered``. A little before the start is mended likewise.
     """
-    (start, end), across = span, _across(inwards)
+    (start, end), across = span, axes_across(inwards)
     # Not what only closes pockets.
     places, known = _places(part), part.distance.copy()
     close = np.flatnonzero((np.abs(places @ inwards - start) < wall + part.voxel) & (part.weight == 0).ravel())

@@ -10,7 +10,7 @@ from scipy.cluster.vq import kmeans2
 from hingesplat.chains import misfit
 from hingesplat.labelling import seed_costs
 from hingesplat.register import register
-from hingesplat.screw import matrix_to_screw
+from hingesplat.screw import axes_across, matrix_to_screw
 from hingesplat.se3 import moved
 from hingesplat.search import BASE, Motion, ScoreVolume, inverted, scan
 from hingesplat.stereo import Cloud
@@ -184,10 +184,7 @@ def refine_motion(
 ) -> Motion:
     """A finer search around one hypothesis: its axis tilted by up to ``spread_deg``, angles and slides to match."""
     tilt = np.tan(np.radians(spread_deg))
-    helper = np.eye(3)[np.abs(motion.axis).argmin()]
-    u = np.cross(motion.axis, helper)
-    u /= np.linalg.norm(u)
-    w = np.cross(motion.axis, u)
+    u, w = axes_across(motion.axis)
     tilted = np.array([motion.axis + tilt * (a * u + b * w) for a in (-1, 0, 1) for b in (-1, 0, 1) if a or b])
     tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
     values = motion.value + np.linspace(-1, 1, 9) * (

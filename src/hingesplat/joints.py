@@ -24,6 +24,7 @@ from hingesplat.poses import (
     pose_step,
     state_loss,
 )
+from hingesplat.screw import axes_across
 from hingesplat.se3 import rotvec_to_matrix
 from hingesplat.stereo import DepthMap
 from hingesplat.symmetry import round_about
@@ -91,13 +92,9 @@ class JointPoses:
         """
         self.extent, self.parents = extent, list(parents) or [0] * len(types)
         self.revolute = torch.tensor([kind == "revolute" for kind in types]).to(device)
-        basis = []
-        for axis in axes:
-            u = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-            u /= np.linalg.norm(u)
-            basis.append(np.stack([u, np.cross(axis, u)]))
+        across = np.stack([axes_across(axis) for axis in axes])
         self.across, self.axis0, self.pivot0, self.value0 = (
-            torch.from_numpy(x).float().to(device) for x in (np.stack(basis), axes, pivots, values)
+            torch.from_numpy(x).float().to(device) for x in (across, axes, pivots, values)
         )
         unit = torch.where(self.revolute, 1.0, extent)
         self.unit = unit

@@ -45,7 +45,7 @@ from hingesplat.run_folder import (
     load_result,
     log_file,
     open_folder,
-    read_json,
+    read_record,
     take_over,
     versions,
     write_tensors,
@@ -138,7 +138,7 @@ class Curves:
 
     def __init__(self, path: Path, report: Report) -> None:
         self.path, self.pass_on = path, report
-        self.series: dict[str, dict[str, list[float]]] = read_json(path) if path.is_file() else {}
+        self.series: dict[str, dict[str, list[float]]] = read_record(path)
 
     def report(self, *, stage: str, state: int | None = None, **numbers: Any) -> None:
         """Pass on, and take down every step that goes further than the last."""
@@ -233,7 +233,7 @@ def reconstruct(
 
 
 def _run_stages(run: Run, curves: Curves) -> None:
-    finished = read_json(run / "stages.json") if (run / "stages.json").is_file() else {}
+    finished = read_record(run / "stages.json")
     for name, stage in STAGES.items():
         if name in finished:
             log.info("%s: done before", name)

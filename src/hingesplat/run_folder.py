@@ -21,8 +21,9 @@ from torch import Tensor
 from hingesplat.camera import common_up
 from hingesplat.capture import Capture, load_cameras
 from hingesplat.errors import HingesplatError
-from hingesplat.files import whole_file, write_json
+from hingesplat.files import read_json, whole_file, write_json
 from hingesplat.gaussians import Gaussians
+from hingesplat.logs import heard_by
 from hingesplat.physics import RepelConfig, draw_repel_points
 from hingesplat.twin import Twin
 
@@ -75,8 +76,7 @@ def repel_points_of(folder: Path) -> np.ndarray:
 
 
 def _config_of(folder: Path) -> dict[str, Any]:
-    path = folder / "config.json"
-    return read_json(path) if path.is_file() else {}
+    return read_record(folder / "config.json")
 
 
 def load_meshes(folder: Path, twin: Twin) -> dict[int, trimesh.Trimesh]:
@@ -98,6 +98,11 @@ def load_meshes(folder: Path, twin: Twin) -> dict[int, trimesh.Trimesh]:
     return meshes
 
 
+def read_record(path: Path) -> dict[str, Any]:
+    """A JSON file of a run; empty where there is none."""
+    return read_json(path, "give another folder", absent={})
+
+
 # Whose it is.
 
 
@@ -110,7 +115,7 @@ def open_folder(folder: Path, capture: Capture, config: Any, overwrite: bool) ->
         "photographs": fingerprint(capture),
     }
     if path.is_file():
-        known = read_json(path)
+        known = read_record(path)
         if "photographs" not in known:
             raise HingesplatError(f"{folder}: its config.json is not that of a run; give another folder")
         if not overwrite:
@@ -159,14 +164,14 @@ def take_over(folder: Path, parents: Sequence[Path], inherited: Inherited) -> No
             shutil.copy2(path, folder / path.name)
     if (best / "curves.json").is_file():
         shutil.copy2(best / "curves.json", folder / "curves.json")
-    finished = read_json(best / "stages.json")
+    finished = read_record(best / "stages.json")
     write_json(folder / "stages.json", {name: finished[name] for name in shared[best]})
 
 
 def _stages_shared(parent: Path, wanted: dict[str, Any], inherited: Inherited) -> list[str]:
     """The first stages of a run that the same photographs and options would make again."""
     known = flat(_config_of(parent))
-    finished = read_json(parent / "stages.json") if (parent / "stages.json").is_file() else {}
+    finished = read_record(parent / "stages.json")
     shared = []
     for name, (options, _) in inherited.items():
         keys = [k for k in wanted if any(k == o or k.startswith(f"{o}.") for o in options)]
@@ -215,16 +220,6 @@ def write_tensors(path: Path, tensors: dict[str, Tensor]) -> None:
         save_file({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, str(tmp))
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(path.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as e:
-        raise HingesplatError(f"{path}: not valid JSON; give another folder") from e
-    if not isinstance(data, dict):
-        raise HingesplatError(f"{path}: must hold a JSON object; give another folder")
-    return data
-
-
 class _LogFile(logging.FileHandler):
     """Silent where it cannot write: a full disk is reported by the stage that meets it."""
 
@@ -237,14 +232,9 @@ def log_file(path: Path) -> Iterator[None]:
     """What the package logs goes to this file, too."""
     handler = _LogFile(path, encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s", "%Y-%m-%d %H:%M:%S"))
-    package = logging.getLogger("hingesplat")
-    level = package.level
-    package.addHandler(handler)
-    package.setLevel(logging.INFO)
     try:
-        yield
+        with heard_by(handler):
+            yield
     finally:
-        package.setLevel(level)
-        package.removeHandler(handler)
         with suppress(OSError):
             handler.close()

@@ -101,6 +101,13 @@ def line_distance(p: ArrayLike, d: ArrayLike, q: ArrayLike, e: ArrayLike) -> flo
     return float(abs(between @ normal) / length)
 
 
+def axes_across(axis: np.ndarray) -> Float[np.ndarray, "2 3"]:
+    """Two unit vectors that make a right-handed frame with a unit axis (3,) before them."""
+    u = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    u /= np.linalg.norm(u)
+    return np.stack([u, np.cross(axis, u)])
+
+
 def _unit(axis: ArrayLike) -> np.ndarray:
     a = np.asarray(axis, float)
     length = np.linalg.norm(a)

@@ -102,6 +102,18 @@ def floating(answer: np.ndarray) -> np.ndarray:
     return (answer[:, FREE] >= 3) & (answer[:, FREE] > 0.15 * answer[:, : HIDDEN + 1].sum(1))
 
 
+def must_have_moved(
+    surfaces: tuple[Surface, Surface], extent: float, rng: np.random.Generator
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Rows of each state's points, thinned, that must have moved; and what the other state's cameras say of all."""
+    answers = [ask(here.points, here.colours, other.sight) for here, other in (surfaces, surfaces[::-1])]
+    rows = []
+    for surface, answer in zip(surfaces, answers, strict=True):
+        index = np.flatnonzero(floating(answer))
+        rows.append(index[thin(surface.points[index], 0.012 * extent, rng)])
+    return rows, answers
+
+
 def gather(
     surfaces: tuple[Surface, Surface],
     low: np.ndarray,
@@ -115,11 +127,7 @@ def gather(
     """
     extent = float((high - low).max())
     sights = [surface.sight for surface in surfaces]
-    answers = [ask(surfaces[s].points, surfaces[s].colours, sights[1 - s]) for s in (0, 1)]
-    seeds = []
-    for surface, answer in zip(surfaces, answers, strict=True):
-        index = np.flatnonzero(floating(answer))
-        seeds.append(index[thin(surface.points[index], 0.012 * extent, rng)])
+    seeds, answers = must_have_moved(surfaces, extent, rng)
     # Where both states show a surface, nothing that moved has come to lie.
     fresh = [s.rows(np.flatnonzero(novelty(a) > 0.5)) for s, a in zip(surfaces, answers, strict=True)]
 
@@ -286,11 +294,9 @@ def _moving(
     """The extent of two states, and each state's points (n, 3), thinned, that must have moved."""
     rng = np.random.default_rng(seed)
     low, high, surfaces = survey(gaussians, views, maps, config)
-    extent, points = float((high - low).max()), []
-    for surface, other in (surfaces, surfaces[::-1]):
-        some = surface.points[floating(ask(surface.points, surface.colours, other.sight))]
-        points.append(some[thin(some, 0.012 * extent, rng)])
-    return extent, points
+    extent = float((high - low).max())
+    rows = must_have_moved(surfaces, extent, rng)[0]
+    return extent, [surface.points[index] for surface, index in zip(surfaces, rows, strict=True)]
 
 
 def _left_over(

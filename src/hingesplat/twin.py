@@ -1,6 +1,5 @@
 """The third noun: a base, movable parts, and the joints between them. ``twin.json`` is its file."""
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -10,7 +9,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from hingesplat.errors import HingesplatError
-from hingesplat.files import write_json
+from hingesplat.files import read_json, write_json
 from hingesplat.screw import joint_motion
 
 VERSION = 1
@@ -126,8 +125,8 @@ class Twin:
         """
         if not path.is_file():
             raise HingesplatError(f"{path}: no such file; run `hingesplat reconstruct` first")
+        data = read_json(path)
         try:
-            data = json.loads(path.read_text())
             if data["version"] != VERSION:
                 raise HingesplatError(f"{path}: version {data['version']}, this program reads {VERSION}")
             parts = tuple(Part(**p) for p in data["parts"])
@@ -145,8 +144,6 @@ class Twin:
                 for j in data["joints"]
             )
             twin = Twin(parts, joints, data["units"], data["metres_per_unit"])
-        except (json.JSONDecodeError, UnicodeDecodeError) as e:
-            raise HingesplatError(f"{path}: not valid JSON ({e})") from e
         except (KeyError, TypeError) as e:
             raise HingesplatError(f"{path}: key {e} missing or unknown") from e
         if fault := _fault(twin):

@@ -3,8 +3,9 @@
 from dataclasses import replace
 from pathlib import Path
 
-from hingesplat.capture.frames import Frame, StateFrames, natural_key, number, read_json, state_folders
+from hingesplat.capture.frames import Frame, StateFrames, natural_key, number, state_folders
 from hingesplat.capture.transforms import frame_dicts, read_frame
+from hingesplat.files import read_json
 
 LOOKED_FOR = "transforms_train.json or transforms_train_start.json at the root (ArtGS)"
 MIN_DEPTH = 0.1

@@ -1,6 +1,5 @@
 """What a reader finds before any pixel is decoded, and the helpers that every reader shares."""
 
-import json
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -43,21 +42,6 @@ class StateFrames:
     folder: Path
     train: list[Frame]
     test: list[Frame]
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object; raises HingesplatError naming the file, and the line where it breaks."""
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as e:
-        raise HingesplatError(f"{path}: cannot be read ({e.strerror or e})") from e
-    except UnicodeDecodeError as e:
-        raise HingesplatError(f"{path}: broken JSON: not UTF-8 text") from e
-    except json.JSONDecodeError as e:
-        raise HingesplatError(f"{path}: broken JSON at line {e.lineno}, column {e.colno}: {e.msg}") from e
-    if not isinstance(data, dict):
-        raise HingesplatError(f"{path}: must hold a JSON object, not a {type(data).__name__}")
-    return data
 
 
 def require(data: dict[str, Any], key: str, where: str) -> Any:

@@ -10,13 +10,13 @@ from hingesplat.capture.frames import (
     Frame,
     StateFrames,
     natural_key,
-    read_json,
     require,
     rigid,
     state_folders,
 )
 from hingesplat.capture.images import image_size
 from hingesplat.errors import HingesplatError
+from hingesplat.files import read_json
 
 LOOKED_FOR = "STATE/camera_train.json (PARIS)"
 

@@ -10,7 +10,6 @@ from hingesplat.capture.frames import (
     Frame,
     StateFrames,
     number,
-    read_json,
     reject_distortion,
     require,
     rigid,
@@ -18,6 +17,7 @@ from hingesplat.capture.frames import (
 )
 from hingesplat.capture.images import image_size
 from hingesplat.errors import HingesplatError
+from hingesplat.files import read_json
 
 LOOKED_FOR = "STATE/transforms.json or STATE/transforms_train.json (STATE: start, end, state0, state_0, …)"
 PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")

@@ -16,6 +16,7 @@ from hingesplat.errors import HingesplatError
 from hingesplat.export.links import Link, axis_load, joint_dynamics, servo_gain, touching
 from hingesplat.export.solids import colours
 from hingesplat.gaussians import Gaussians
+from hingesplat.screw import axes_across
 
 try:
     from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdPhysics, UsdValidation, UsdVol, Vt  # pyright: ignore[reportMissingImports]
@@ -167,10 +168,7 @@ def _add_joint(stage: Usd.Stage, link: Link, links: list[Link]) -> None:
 
 def _x_to(axis: np.ndarray) -> np.ndarray:
     """A rotation (3, 3) that takes x to a unit vector."""
-    helper = np.eye(3)[np.abs(axis).argmin()]
-    second = np.cross(axis, helper)
-    second /= np.linalg.norm(second)
-    return np.column_stack([axis, second, np.cross(axis, second)])
+    return np.column_stack([axis, *axes_across(axis)])
 
 
 def _quat(R: np.ndarray) -> Gf.Quatf:

@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 
 from hingesplat.errors import HingesplatError
-from hingesplat.files import write_text
+from hingesplat.files import read_json, write_text
 from hingesplat.metrics.motion import joint_errors
 from hingesplat.metrics.surface import SAMPLES, chamfer, clean, match, overlap, penetration, sample
 from hingesplat.metrics.truth import Truth, load_mesh, load_truth
@@ -227,10 +227,7 @@ def _score_views(
 def _capture_of(run: Path) -> tuple[Path, int | None]:
     """The capture a run was made from and the size its photographs were reduced to, from its config.json."""
     path = run / "config.json"
-    try:
-        config = json.loads(path.read_text())
-        return Path(config["capture"]), config.get("max_size")
-    except FileNotFoundError:
-        raise HingesplatError(f"{path}: no such file; the photographs are not known") from None
-    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as e:
-        raise HingesplatError(f"{path}: broken, or without the key 'capture' ({e})") from e
+    config = read_json(path, "the photographs are not known")
+    if not isinstance(config.get("capture"), str):
+        raise HingesplatError(f"{path}: lacks the key 'capture'; the photographs are not known")
+    return Path(config["capture"]), config.get("max_size")

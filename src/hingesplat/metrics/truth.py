@@ -1,6 +1,5 @@
 """Reads the two kinds of truth folder: a tree of joints with part meshes, and that of PARIS and ArtGS."""
 
-import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 import trimesh
 
 from hingesplat.errors import HingesplatError
+from hingesplat.files import read_json
 from hingesplat.screw import joint_motion
 
 PARIS_STATES = ("start", "end")
@@ -76,9 +76,9 @@ def load_truth(path: Path) -> Truth:
     """
     for folder in (path, path / "truth", path / "gt", path / "textured_objs"):
         if (folder / "joints.json").is_file():
-            return _load_tree(folder, _read_json(folder / "joints.json"))
+            return _load_tree(folder, read_json(folder / "joints.json"))
         if (folder / "trans.json").is_file():
-            return _load_paris(folder, _read_json(folder / "trans.json"))
+            return _load_paris(folder, read_json(folder / "trans.json"))
     raise HingesplatError(f"{path}: no truth here; looked for joints.json and trans.json (also in truth/, gt/)")
 
 
@@ -171,16 +171,6 @@ def _load_paris(folder: Path, data: dict[str, Any]) -> Truth:
     except (KeyError, TypeError, ValueError) as e:
         raise HingesplatError(f"{where}: key missing or of the wrong kind ({e})") from e
     return Truth(folder, parts, tuple(joints), {})
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(path.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as e:
-        raise HingesplatError(f"{path}: not valid JSON ({e})") from e
-    if not isinstance(data, dict):
-        raise HingesplatError(f"{path}: should hold one object, holds a {type(data).__name__}")
-    return data
 
 
 def _type(name: str, where: Path) -> Literal["revolute", "prismatic"]:

@@ -2,7 +2,6 @@
 
 import base64
 import gzip
-import json
 import math
 from dataclasses import replace
 from datetime import datetime
@@ -16,7 +15,7 @@ import torch
 
 from hingesplat.errors import HingesplatError
 from hingesplat.export.spz import MAX_DEGREE, spz_bytes
-from hingesplat.files import write_text
+from hingesplat.files import read_json, write_text
 from hingesplat.gaussians import Gaussians, posed
 from hingesplat.pictures import part_colour
 from hingesplat.report.curves import chart_rows
@@ -47,11 +46,14 @@ def write_report(folder: Path) -> Path:
 
 
 def _page(folder: Path, twin: Twin, gaussians: Gaussians) -> str:
-    shown = _read(folder / "views" / "views.json") or {"up": [0, 0, 1], "held_out": False, "views": []}
+    def told(name: str) -> dict[str, Any]:
+        return read_json(folder / name, "make it again or delete it", absent={})
+
+    shown = {"up": [0, 0, 1], "held_out": False, "views": []} | told("views/views.json")
     views = [_embedded(view, folder / "views") for view in shown["views"]]
     first = next((view for view in views if view["state"] == views[-1]["state"]), None)
-    config = _read(folder / "config.json") or {}
-    stages = _read(folder / "stages.json") or {}
+    config = told("config.json")
+    stages = told("stages.json")
     bundle = gzip.compress(_resource("bundle.js").encode(), 9, mtime=0)
     template = _environment().get_template("page.html")
     return template.render(
@@ -66,10 +68,10 @@ def _page(folder: Path, twin: Twin, gaussians: Gaussians) -> str:
         views=views,
         first=first,
         held_out=shown["held_out"],
-        charts=chart_rows(_read(folder / "curves.json") or {}),
+        charts=chart_rows(told("curves.json")),
         seconds={name: entry["seconds"] for name, entry in stages.items()},
-        summary=_read(folder / "summary.json"),
-        metrics=_read(folder / "metrics.json"),
+        summary=told("summary.json"),
+        metrics=told("metrics.json"),
         exports=[path for path in EXPORTS if (folder / path).is_file()],
         style=_resource("page.css"),
         bundle=base64.b64encode(bundle).decode(),
@@ -172,16 +174,6 @@ def _embedded(view: dict[str, Any], folder: Path) -> dict[str, Any]:
     except FileNotFoundError as e:
         raise HingesplatError(f"{e.filename}: missing; reconstruct again") from e
     return view | {what: f"data:image/webp;base64,{text}" for what, text in data.items()}
-
-
-def _read(path: Path) -> Any:
-    """A JSON file of the run; None where there is none."""
-    if not path.is_file():
-        return None
-    try:
-        return json.loads(path.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as e:
-        raise HingesplatError(f"{path}: not valid JSON; make it again or delete it") from e
 
 
 def _resource(name: str) -> str:
