@@ -76,8 +76,7 @@ def test_an_alignment_that_photographs_hardly_like_better_must_leave_the_part_on
 ) -> None:
     """One door left its hinge for two per cent; another came from 11° off to 1° for less than that."""
     made = scene("revolute", 64, 0.06)
-    errors = iter([np.array([0.0689]), np.array([0.0673])])
-    monkeypatch.setattr("hingesplat.articulate._mean_errors", lambda *_: next(errors))
+    monkeypatch.setattr("hingesplat.articulate._mean_errors", lambda *_: np.array([[0.0689], [0.0673]]))
     wild = {"align_steps": 4, "align_rate": 0.3}
     config = replace(CONFIG, steps=1, pose_rate=0.0, **(wild if astray else {"align_steps": 240}))
     before = 2.0 if astray else 8.0

@@ -7,10 +7,10 @@ from torch.autograd import gradcheck
 
 from hingesplat.gaussians import Gaussians
 from hingesplat.optim import GaussianAdam, LearningRates
-from hingesplat.poses import PoseDelta, StateLossConfig, draw_state, part_centres, state_loss
+from hingesplat.poses import PoseDelta, StateLossConfig, draw_state, errors_by_part, part_centres, state_loss
 from hingesplat.render import move, render
 from hingesplat.se3 import apply, rotvec_to_matrix
-from hingesplat.training import training_view
+from hingesplat.training import training_view, training_views
 from scenes import (
     one_thread,  # noqa: F401
     scene,
@@ -148,3 +148,16 @@ def test_light_of_the_other_state_leaves_state_0_alone_and_is_paid_for() -> None
     gradient = optimiser.values["state_sh"].grad
     assert gradient is not None and float(gradient.sum()) > 0
     assert np.isfinite(float(loss.detach()))
+
+
+def test_a_part_that_hides_is_judged_where_it_should_be_seen() -> None:
+    """A door once sank into its cabinet: the strip of it that was left agreed with the photographs."""
+    training = training_views([views[:4] for views in MADE.views])
+    R, t = PoseDelta(T, CENTRES, 2.0).Rt()
+    away = t.detach().clone()
+    away[1, 1] += 100.0
+    true, gone = errors_by_part(G, [(R, t), (R, away)], training)
+    assert np.isfinite(gone[:, 0]).any() and (np.isfinite(true) == np.isfinite(gone)).all()
+    assert np.nanmean(gone) > 3 * np.nanmean(true)
+    np.testing.assert_array_equal(errors_by_part(G, [(R, away), (R, t)], training)[::-1], [true, gone])
+    assert np.isnan(errors_by_part(G, [(R, away)], training)).all()

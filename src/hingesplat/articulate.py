@@ -165,21 +165,24 @@ def _align(
     hardly so and its surface comes off that of the ``fitted`` Gaussians: the insides of a door, unseen so far, draw it.
     """
     some = [state[:: max(len(state) // JUDGES, 1)] for state in training]
-    before, off = _mean_errors(canonical, poses, some), _misfits(canonical, poses, fitted, extent)
+    (R, t), off = poses.Rt(), _misfits(canonical, poses, fitted, extent)
     steps, rate = config.align_steps, config.align_rate
     move_parts_alone(canonical, poses, training, steps, rate, config.render.ssim_weight, rng, end=0.1)
-    after, still_on = _mean_errors(canonical, poses, some), _misfits(canonical, poses, fitted, extent) < off + ASTRAY
+    before, after = _mean_errors(canonical, [(R, t), poses.Rt()], some)
+    still_on = _misfits(canonical, poses, fitted, extent) < off + ASTRAY
     good = (after < BETTER * before) | ((after < before) & still_on)
     with torch.no_grad():
         for correction in poses.parameters:
             correction[:, 1:] *= torch.from_numpy(good).to(correction)[:, None]
 
 
-def _mean_errors(g: Gaussians, poses: PoseDelta, training: Sequence[Sequence[TrainingView]]) -> np.ndarray:
-    """(movers,) mean over the photographs that show each; infinite where none does."""
-    errors = errors_by_part(g, *poses.Rt(), training)
+def _mean_errors(
+    g: Gaussians, trials: Sequence[tuple[Tensor, Tensor]], training: Sequence[Sequence[TrainingView]]
+) -> np.ndarray:
+    """(trials, movers) mean of ``errors_by_part`` over the photographs that show each; infinite where none does."""
+    errors = errors_by_part(g, trials, training)
     seen = np.isfinite(errors)
-    return np.where(seen.any(0), np.where(seen, errors, 0).sum(0) / np.maximum(seen.sum(0), 1), np.inf)
+    return np.where(seen.any(1), np.where(seen, errors, 0).sum(1) / np.maximum(seen.sum(1), 1), np.inf)
 
 
 @torch.no_grad()

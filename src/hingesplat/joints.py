@@ -222,26 +222,26 @@ def _choose_types(
     A slide is the simpler model, so a rotation must win significantly over the views. All joints are tried at once with
     one type and then the other; only a joint whose verdict is close depends on its neighbours' types.
     """
-    losses, reach = {}, torch.zeros(n_joints)
+    trials, reach = [], torch.zeros(n_joints)
     for kind in ("prismatic", "revolute"):
         poses = poses_of([kind] * n_joints)
         weight = config.render.ssim_weight
         move_parts_alone(g, poses, training, config.type_steps, config.rate, weight, rng, state_sh=sh)
-        R, t = poses.Rt()
-        losses[kind] = errors_by_part(g, R, t, training, sh)
+        trials.append(poses.Rt())
         if kind == "revolute":
             offset = (part_centres(g, n_joints + 1)[1:] - poses.pivot()).detach()
             reach = torch.linalg.cross(offset, poses.axis().detach(), dim=1).norm(dim=1) / poses.extent
+    slides, turns = errors_by_part(g, trials, training, sh)
     kinds: list[JointType] = []
     confidence = np.zeros(n_joints)
     for j in range(n_joints):
-        difference = losses["prismatic"][:, j] - losses["revolute"][:, j]
+        difference = slides[:, j] - turns[:, j]
         difference = difference[np.isfinite(difference)]
         z = gain = 0.0
         if len(difference):  # Photographs that show the part with both.
             error = difference.std() / math.sqrt(len(difference)) + 1e-12
             z = float(difference.mean() / error)
-            gain = float(difference.mean() / np.nanmean(losses["prismatic"][:, j]))
+            gain = float(difference.mean() / np.nanmean(slides[:, j]))
         hinged = z > config.type_significance and gain > config.type_gain and float(reach[j]) < config.hinge_reach
         log.debug("joint %d: z %.1f, gain %.3f, reach %.2f", j + 1, z, gain, float(reach[j]))
         kinds.append("revolute" if hinged else "prismatic")

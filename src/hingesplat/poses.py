@@ -140,27 +140,34 @@ def drawn_parts(
 
 def errors_by_part(
     g: Gaussians,
-    R: Tensor,
-    t: Tensor,
+    trials: Sequence[tuple[Tensor, Tensor]],
     training: Sequence[Sequence[TrainingView]],
     state_sh: Tensor | None = None,
 ) -> np.ndarray:
-    """How well photographs agree with each part's poses, where the part is drawn; those of state 0 are not asked.
+    """How well photographs agree with each part's poses, where any of the trials draws the part.
 
-    Arguments as for ``drawn_parts``.
+    A part that hides behind others would else be judged by the few pixels that it still has. Photographs of state 0 are
+    not asked.
+
+    Args:
+        trials: poses R (states, parts, 3, 3), t (states, parts, 3) to compare.
+        training, state_sh: as for ``drawn_parts``.
 
     Returns:
-        (views, parts − 1) mean absolute error over the pixels near each moving part; NaN where it is hardly seen.
+        (trials, views, parts − 1) mean absolute error over the pixels near each moving part; NaN where it is hardly
+        seen.
     """
+    sh = None if state_sh is None else state_sh[1:]
     rows = []
-    for view, r in drawn_parts(g, R[1:], t[1:], training[1:], None if state_sh is None else state_sh[1:]):
-        error = (r.rgba - view.image).abs().mean(0)
-        tall = torch.nn.functional.max_pool2d(r.channels[None], (15, 1), 1, (7, 0))
-        region = torch.nn.functional.max_pool2d(tall, (1, 15), 1, (0, 7))[0] > 0.3
-        area = region.flatten(1).sum(1)
-        mean = (error * region).flatten(1).sum(1) / area.clamp_min(1)
+    for drawn in zip(*(drawn_parts(g, R[1:], t[1:], training[1:], sh) for R, t in trials), strict=True):
+        error = torch.stack([(r.rgba - view.image).abs().mean(0) for view, r in drawn])[:, None]
+        share = torch.stack([r.channels for _, r in drawn]).amax(0)[None]
+        tall = torch.nn.functional.max_pool2d(share, (15, 1), 1, (7, 0))
+        region = torch.nn.functional.max_pool2d(tall, (1, 15), 1, (0, 7)) > 0.3
+        area = region.flatten(2).sum(2)
+        mean = (error * region).flatten(2).sum(2) / area.clamp_min(1)
         rows.append(torch.where(area > 30, mean, torch.nan).cpu().numpy())
-    return np.stack(rows)
+    return np.stack(rows, 1)
 
 
 def pose_step(adam: torch.optim.Adam, rate: float, progress: float, end: float = 0.02) -> None:
