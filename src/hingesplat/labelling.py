@@ -171,13 +171,11 @@ class Labelling:
         """
         costs, partners = self.costs(T_1_0), self.partners(T_1_0)
 
-        def solve(columns: list[int], iterations: int) -> tuple[Labels, float]:
-            return self.mean_field([c[:, columns] for c in costs], [p[:, columns] for p in partners], iterations)
-
+        # Fewer iterations would leave energies off by as much as one look-alike differs from another.
         @cache
         def solved(kept: frozenset[int]) -> tuple[Labels, float]:
             columns = [0, *sorted(kept)]
-            (first, second), energy = solve(columns, 8)
+            (first, second), energy = self.mean_field([c[:, columns] for c in costs], [p[:, columns] for p in partners])
             too_many = 0 if parts is None else max(len(kept) - parts, 0)
             price = part_cost * len(kept) + sum(map(len, costs)) * too_many
             return (np.array(columns)[first], np.array(columns)[second]), energy + price
@@ -186,8 +184,10 @@ class Labelling:
             lambda kept: solved(kept)[1],
             lambda kept: self.promising(costs, partners, solved(kept)[0]),
         )
-        chosen = sorted(kept)
-        return [k - 1 for k in chosen], solve([0, *chosen], 20)[0]
+        rank = np.zeros(costs[0].shape[1], int)
+        rank[sorted(kept)] = np.arange(1, len(kept) + 1)
+        first, second = solved(kept)[0]
+        return [k - 1 for k in sorted(kept)], (rank[first], rank[second])
 
     def promising(self, costs: list[np.ndarray], partners: list[np.ndarray], labels: Labels) -> list[int]:
         """Labels (columns) but the first, those first that the points would gain most by if their partners agreed."""
