@@ -1,5 +1,7 @@
 """A drawer: what one state alone shows of it is its own, and what its cabinet hides goes on as it was last seen."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -105,3 +107,25 @@ def test_a_flat_part_has_no_section() -> None:
     plate = tray(0.15)[:1600]
     part = grid()
     assert drawn_out(part, plate, BACK, [np.eye(4), prismatic([1, 0, 0], 0.3)], (0.02, 0.04)) is part
+
+
+def test_a_bottom_that_was_always_hidden_is_there_and_an_open_top_stays_open() -> None:
+    part = grid()
+    z = part.lower[2] + 0.01 * np.arange(36)
+    below = np.broadcast_to((z < 0.06) & (z > -0.06), part.distance.shape).copy()
+    below[:, :8] = False  # The front was seen.
+    x = np.abs(part.lower[0] + 0.01 * np.arange(71))
+    below[x > 0.23] = False  # So were the sides.
+    part = replace(part, weight=np.where(below, 0, part.weight), distance=np.where(below, 1, part.distance))
+    found = drawn_out(part, tray(0.15), BACK, [np.eye(4), OUT], (0.02, 0.04))
+    for y in (0.1, 0.3, 0.6):
+        assert solid_at(found, 0, y, -0.01) and solid_at(found, 0.25, y, 0.1)
+        assert not solid_at(found, 0, y, 0.1) and not solid_at(found, 0, y, 0.19) and not solid_at(found, 0, y, -0.05)
+
+
+def test_a_wall_with_a_ragged_end_goes_on_from_where_it_was_whole() -> None:
+    part = grid()
+    notch = part.distance.copy()
+    notch[61 - 5 : 61 + 5, 16:, 12:] = 1  # Of the wall at x = 0.25, behind y = 0.11: seen to be free, by mistake.
+    found = drawn_out(replace(part, distance=notch), tray(0.15), BACK, [np.eye(4), OUT], (0.02, 0.04))
+    assert all(solid_at(found, x, y, 0.15) for x in (-0.25, 0.25) for y in (0.12, 0.14, 0.3))

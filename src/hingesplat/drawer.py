@@ -5,7 +5,7 @@ end is the worse one: its walls go on up to a back just before that of the cabin
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -17,16 +17,22 @@ from hingesplat.se3 import moved
 from hingesplat.surface import Labels, Surface, components
 from hingesplat.tsdf import DistanceGrid
 
-SEEN = 0.5
-"""Share of a cross-section that must have been seen, of what its outline holds."""
+SEEN = 0.2
+"""Share of what its walls enclose that must have been seen, for it to be hollow."""
 FULL = 0.6
-"""Share of it that is solid in a block, a panel, or a drawer whose back was seen: these end where they end."""
+"""Share of it that is solid in a block, a panel, or a drawer's front: these end where they end."""
 INNER = 0.8
 """Share of an outline's width and height that its walls leave."""
-SPAN = 0.5
+OFTEN = 0.25
+"""Share of the slices that show most of its cells in which a cell of it must have been seen."""
+WHOLE = 0.9
+"""Share of its walls that a slice must show to be the last that counts, of those that the best slice shows."""
+SPAN = 0.6
 """Share of an outline's width that a back spans; what spans less is something in the drawer."""
 STRAY = 0.02
 """Share of a surface that may lie deeper than its last cross-section."""
+MARGIN = 3
+"""Empty cells around a cross-section."""
 NARROW = 0.08
 """Extents of the object that a drawer is wide and high at least, for its contents to be told from its walls."""
 FEWEST = 24
@@ -92,10 +98,10 @@ def drawn_out(
             continue
         covered = _outline(front @ across.T)  # A drawer's box is behind its front.
         box = surface[covered.find_simplex(surface @ across.T) >= 0]
-        found = _section(part, box, inwards, own)
-        if found is None:
+        section = _section(part, box, inwards, covered, own)
+        if section is None:
             continue
-        start, outline = found
+        start, outline = section.start, section.outline
         farthest = float((ways @ inwards).max())
         behind = base[base @ inwards > start + farthest + wall]
         behind = behind[_inner(outline, behind @ across.T)] @ inwards
@@ -103,13 +109,16 @@ def drawn_out(
             continue
         end = float(np.median(behind)) - farthest - wall
         inside = box[(box @ inwards > start) & _inner(outline, box @ across.T)]
-        if len(inside) >= FEWEST:
-            back = float(np.median(inside @ inwards))
-            face = inside[np.abs(inside @ inwards - back) < own] @ across.T
-            if np.ptp(face, axis=0).max() > SPAN * np.ptp(outline.points, axis=0).max():
-                end = min(end, back + own)
+        for back in np.arange(end, start, -own):  # Its own back, if that was seen.
+            face = inside[np.abs(inside @ inwards - back) < own / 2]
+            if (
+                len(face) >= FEWEST
+                and np.ptp(face @ across.T, axis=0).max() > SPAN * np.ptp(outline.points, axis=0).max()
+            ):
+                end = float(np.median(face @ inwards)) + own
+                break
         if end > start + 2 * own:
-            part = _extruded(part, box, inwards, (start, end), covered, own)
+            part = _extruded(part, section, inwards, end, covered, own)
     return part
 
 
@@ -144,74 +153,90 @@ def _inner(outline: Delaunay, flat: np.ndarray) -> np.ndarray:
     return outline.find_simplex(middle + (flat - middle) / INNER) >= 0
 
 
-def _places(grid: DistanceGrid) -> np.ndarray:
-    """(voxels, 3) centres, in the order of a raveled grid."""
-    return grid.lower + grid.voxel * np.indices(grid.distance.shape).reshape(3, -1).T
+@dataclass(frozen=True)
+class _Section:
+    """What a drawer looks like across its way, and how deep it was seen whole."""
+
+    front: float
+    """Where its front ends, along the way inwards."""
+    start: float
+    """Where its walls were last whole."""
+    outline: Delaunay
+    """Of its walls, (points, 2) across the way."""
+    lower: np.ndarray
+    """(2,) centre of the first cell."""
+    cell: float
+    profile: np.ndarray
+    """(cells, cells) distance to its walls, as in ``DistanceGrid``."""
+
+    def at(self, flat: np.ndarray) -> np.ndarray:
+        """(n,) the distance at points (n, 2) across the way."""
+        return ndimage.map_coordinates(self.profile, ((flat - self.lower) / self.cell).T, order=1, cval=1.0)
 
 
 def _section(
-    part: DistanceGrid, surface: np.ndarray, inwards: np.ndarray, wall: float
-) -> tuple[float, Delaunay] | None:
-    """Where, along ``inwards``, the last cross-section lies that was well seen, and its outline; None if it is full.
+    part: DistanceGrid, surface: np.ndarray, inwards: np.ndarray, covered: Delaunay, wall: float
+) -> _Section | None:
+    """The median of all slices behind the front; None if that is full, or too little of it was seen.
 
-    A slice is as thick as a ``wall``, for one voxel alone has gaps, and what is narrower than three is no section.
+    Args:
+        surface: (n, 3) points that were seen of it, behind and in its front, whose outline across is ``covered``.
+        wall: how thick its walls count; what is narrower than three is no section.
     """
-    places, across = _places(part), axes_across(inwards)
-    depth, depth_of_surface = places @ inwards, surface @ inwards
-    seen, solid = (part.weight > 0).ravel(), (part.distance < 0).ravel()
-    deepest, first = np.quantile(depth_of_surface, [1 - STRAY, 0])
-    for at in np.arange(deepest, first, -part.voxel):
-        edge = surface[np.abs(depth_of_surface - at) < wall / 2] @ across.T
-        if len(edge) < FEWEST or _narrowest(edge) < 3 * wall:
-            continue
-        outline = _outline(edge)
-        rows = np.flatnonzero(np.abs(depth - at) < part.voxel / 2)
-        rows = rows[outline.find_simplex(places[rows] @ across.T) >= 0]
-        if len(rows) and seen[rows].mean() > SEEN:
-            return None if solid[rows].mean() > FULL else (float(at), outline)
-    return None
+    across, lower = axes_across(inwards), covered.points.min(0) - MARGIN * part.voxel
+    shape = np.ceil(np.ptp(covered.points, axis=0) / part.voxel).astype(int) + 1 + 2 * MARGIN
+    cells = lower + part.voxel * np.indices(shape).reshape(2, -1).T
+    depths = np.arange((surface @ inwards).min(), (surface @ inwards).max(), part.voxel)
+    places = depths[:, None, None] * inwards + cells @ across
+    index = ((places - part.lower) / part.voxel).reshape(-1, 3).T
+    distance = ndimage.map_coordinates(part.distance, index, order=1, cval=1.0).reshape(len(depths), -1)
+    known = ndimage.map_coordinates((part.weight > 0).astype(np.uint8), index, order=0).reshape(len(depths), -1) > 0
+    # Of what nobody saw, walls are known well enough; what only closes pockets is not.
+    guess = np.nonzero(~known & (distance < 0))
+    known[guess] = np.isfinite(KDTree(surface).query(places[guess], distance_upper_bound=wall)[0])
+    solid = known & (distance < 0)
+    full = solid[:, covered.find_simplex(cells) >= 0].mean(1) > FULL
+    behind = slice(int(np.flatnonzero(full).max(initial=-1)) + 1, None)
+    seen = known[behind].sum(0)
+    often = seen > OFTEN * max(int(seen.max(initial=0)), 1)
+    profile = np.ones(len(cells))
+    profile[often] = np.nanmedian(np.where(known, distance, np.nan)[behind][:, often], axis=0)
+    profile[covered.find_simplex(cells) < 0] = 1
+    profile = ndimage.grey_opening(profile.reshape(shape), 5).ravel()  # Narrow gaps are none.
+    walls = profile < 0
+    if walls.sum() < FEWEST or _narrowest(cells[walls]) < 3 * wall:
+        return None
+    outline = _outline(cells[walls])
+    within = outline.find_simplex(cells) >= 0
+    if walls[within].mean() > FULL or often[within & ~walls].mean() < SEEN:
+        return None
+    # Its rim is wall, too, where nobody saw that it is not: a bottom that was always hidden.
+    core = ndimage.binary_erosion(within.reshape(shape), iterations=2)
+    profile[within & ~core.ravel() & ~often] = -1
+    shown = solid[behind][:, walls].mean(1)
+    start = depths[behind][np.flatnonzero(shown > WHOLE * shown.max()).max()]
+    return _Section(float(depths[behind][0]), float(start), outline, lower, part.voxel, profile.reshape(shape))
 
 
 def _extruded(
-    part: DistanceGrid,
-    surface: np.ndarray,
-    inwards: np.ndarray,
-    span: tuple[float, float],
-    covered: Delaunay,
-    wall: float,
+    part: DistanceGrid, section: _Section, inwards: np.ndarray, end: float, covered: Delaunay, wall: float
 ) -> DistanceGrid:
-    """Unseen voxels of a span along ``inwards`` as they are at its start, and a back before its end.
-
-    All that behind the front, whose outline across is ``covered``. A little before the start is mended likewise.
-    """
-    (start, end), across = span, axes_across(inwards)
-    # Not what only closes pockets.
-    places, known = _places(part), part.distance.copy()
-    close = np.flatnonzero((np.abs(places @ inwards - start) < wall + part.voxel) & (part.weight == 0).ravel())
-    far = np.isinf(KDTree(surface).query(places[close], distance_upper_bound=wall)[0])
-    known.ravel()[close[far]] = 1
-    grid = _longer(part, (end - start + 3 * part.voxel) * inwards)
-    places = _places(grid)
-    rows = np.flatnonzero((places @ inwards > start - wall) & (grid.weight.ravel() == 0))
+    """The part with its walls as they are in its section from where they were last whole to a back before ``end``."""
+    across = axes_across(inwards)
+    grid = _longer(part, (end - section.start + 3 * part.voxel) * inwards)
+    places = grid.lower + grid.voxel * np.indices(grid.distance.shape).reshape(3, -1).T
+    rows = np.flatnonzero(places @ inwards > section.front)
     rows = rows[covered.find_simplex(places[rows] @ across.T) >= 0]
-    places, along = places[rows], places[rows] @ inwards
-    profile = np.ones(len(rows))
-    for before in np.arange(0, wall, part.voxel):  # One section alone has gaps.
-        at_start = (places - (along - start + before)[:, None] * inwards - part.lower) / part.voxel
-        walls = ndimage.map_coordinates(known, at_start.T, order=1, cval=1.0)
-        if (walls < 0).mean() > FULL:
-            break  # The front.
-        profile = np.minimum(profile, walls)
-    flat = places @ across.T
-    if (profile < 0).sum() < FEWEST or _narrowest(flat[profile < 0]) < part.voxel:
-        return part
-    outline = _outline(flat[profile < 0])
-    profile[_inner(outline, flat)] = 1  # What lies in a drawer does not go on.
-    back = np.abs(along - (end - wall / 2)) - wall / 2
-    back = np.where(outline.find_simplex(flat) >= 0, back / part.truncation, 1)
-    distance = grid.distance.ravel().copy()
-    guess = np.minimum(profile, np.where(along < start, distance[rows], back))
-    distance[rows] = np.clip(np.where(along < end, guess, (along - end) / part.truncation), -1, 1)
+    along, flat = places[rows] @ inwards, places[rows] @ across.T
+    walls = section.at(flat)
+    walls[_inner(section.outline, flat) & (walls < 0)] = 1  # What lies in a drawer does not go on.
+    back = (np.abs(along - (end - wall / 2)) - wall / 2) / part.truncation
+    back[section.outline.find_simplex(flat) < 0] = 1
+    guess = np.where(along < end, np.minimum(walls, back), (along - end) / part.truncation)
+    distance, unseen = grid.distance.ravel().copy(), grid.weight.ravel()[rows] == 0
+    # Beside the ragged end of a wall, what was behind it was seen for it.
+    new = np.where(along > section.start, unseen | (guess < 0), unseen & (guess < distance[rows]))
+    distance[rows[new]] = np.clip(guess[new], -1, 1)
     return replace(grid, distance=distance.reshape(grid.distance.shape))
 
 
