@@ -1,5 +1,6 @@
 """Rigid motions to joints."""
 
+from dataclasses import replace
 from functools import cache
 from typing import Literal
 
@@ -160,6 +161,18 @@ def test_type_axis_and_value_are_found(kind: Kind) -> None:
     assert value == pytest.approx(abs(ANGLE) if kind == "revolute" else SLIDE, abs=0.015)
     if kind == "revolute":
         assert line_distance(np.array(joint.pivot), axis, PIVOT, AXIS) < 0.02
+
+
+def test_what_slides_is_not_tried_as_a_turn_about_a_line_far_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A drawer tried so ran away, over the door beside it, which was then taken for a slide."""
+    tried = []
+    monkeypatch.setattr("hingesplat.joints.move_parts_alone", lambda g, p, *_, **__: tried.append(p.revolute.tolist()))
+    for kind in ("prismatic", "revolute"):
+        made = scene(kind, 64, 0.06)
+        sh, nearly = torch.zeros((2, len(made.gaussians), 3)), made.T_state_0.copy()
+        nearly[1, 1] = nearly[1, 1] @ revolute(AXIS, PIVOT, 0.01)
+        find_joints(made.gaussians, nearly, sh, made.views, replace(CONFIG, steps=1, uncertainty_views=0))
+    assert tried == [[False], [False], [False], [True]]
 
 
 @pytest.mark.parametrize("kind", ["revolute", "prismatic"])

@@ -462,6 +462,21 @@ def test_pieces_far_apart_become_parts_with_one_motion() -> None:
     assert motions == [shift] and labels[0].max() == 1
 
 
+@pytest.mark.parametrize("slit", [0.012, 0.0])
+def test_two_doors_on_one_hinge_line_are_two_parts_and_a_plate_on_its_middle_is_one(slit: float) -> None:
+    turn = Motion("revolute", np.eye(3)[1], np.zeros(3), 0.8, 1.0)
+    half = patch((0, 0, 0), 20) + np.array([0.1, 0, 0])
+    first, second = half + np.array([(slit + 0.01) / 2, 0, 0]), half * [-1, 1, 1] - np.array([slit / 2, 0, 0])
+    noise = 0.001 * np.random.default_rng(0).normal(size=(2, 800, 3))
+    doors, base = np.concatenate([first, second]) + noise, patch((0, 0, -1), 20)
+    surfaces = (plain(np.concatenate([base, doors[0]])), plain(np.concatenate([base, moved(doors[1], turn.T)])))
+    label = np.repeat([0, 1], [400, 800])
+    motions, labels = split_pieces([turn], (label, label), surfaces, 1.0, 25)
+    assert len(motions) == (2 if slit else 1)
+    for found in labels:
+        assert len(np.unique(found[400:800])) == len(np.unique(found[800:])) == 1
+
+
 SHIFT = Motion("prismatic", np.eye(3)[2], np.zeros(3), 0.5, 1.0)
 BASE, PART = patch((0, 0, -1), 20), patch((0, 0, 0))
 

@@ -33,6 +33,8 @@ from hingesplat.twin import Joint, JointStd, JointType
 
 log = logging.getLogger(__name__)
 
+JUDGES = 50
+"""Photographs of a state that judge the types."""
 ACROSS, ALONG = 0.17, 0.065
 """Errors that all photographs share (a label, a highlight), in pixels on the object: of places across a hinge line and
 turns about it, and of directions and slides. Taken from the made objects of docs/results.md."""
@@ -219,29 +221,41 @@ def _choose_types(
 ) -> tuple[list[JointType], np.ndarray]:
     """Type of every joint and how sure it is, from photographs: which one-degree motion draws them better.
 
-    A slide is the simpler model, so a rotation must win significantly over the views. All joints are tried at once with
-    one type and then the other; only a joint whose verdict is close depends on its neighbours' types.
+    A slide is the simpler model, so a rotation must win significantly over the views. All joints are tried at once, but
+    each is judged with the others as they are likely to be: a wrong type carries a part before its neighbours.
     """
-    trials, reach = [], torch.zeros(n_joints)
+    weight, tried = config.render.ssim_weight, []
+    far = torch.zeros(n_joints, dtype=torch.bool)
     for kind in ("prismatic", "revolute"):
         poses = poses_of([kind] * n_joints)
-        weight = config.render.ssim_weight
-        move_parts_alone(g, poses, training, config.type_steps, config.rate, weight, rng, state_sh=sh)
-        trials.append(poses.Rt())
         if kind == "revolute":
-            offset = (part_centres(g, n_joints + 1)[1:] - poses.pivot()).detach()
-            reach = torch.linalg.cross(offset, poses.axis().detach(), dim=1).norm(dim=1) / poses.extent
-    slides, turns = errors_by_part(g, trials, training, sh)
+            far = _reach(g, poses) >= config.hinge_reach  # A turn about so far a line would run away.
+            poses = poses_of(["prismatic" if slides else "revolute" for slides in far])
+        move_parts_alone(g, poses, training, config.type_steps, config.rate, weight, rng, state_sh=sh)
+        tried.append([x.detach() for x in poses.Rt()])
+    reach, some = _reach(g, poses), [state[:: max(len(state) // JUDGES, 1)] for state in training]
+    slides, turns = np.nansum(errors_by_part(g, tried, some, sh), axis=1)
+    likely = (turns < slides) & ~far.numpy()
+
+    def mixed(turning: np.ndarray) -> tuple[Tensor, Tensor]:
+        """Poses in which these joints turn, and the others slide."""
+        part = torch.tensor([False, *turning]).to(g.means.device)
+        (R0, t0), (R1, t1) = tried
+        return torch.where(part[:, None, None], R1, R0), torch.where(part[:, None], t1, t0)
+
+    one_other = (likely ^ np.eye(n_joints, dtype=bool)) & ~far.numpy()
+    as_likely, *otherwise = errors_by_part(g, [mixed(turning) for turning in (likely, *one_other)], some, sh)
     kinds: list[JointType] = []
     confidence = np.zeros(n_joints)
     for j in range(n_joints):
-        difference = slides[:, j] - turns[:, j]
-        difference = difference[np.isfinite(difference)]
         z = gain = 0.0
-        if len(difference):  # Photographs that show the part with both.
+        pair = [as_likely[:, j], otherwise[j][:, j]]
+        slide, turn = reversed(pair) if likely[j] else pair
+        difference = (slide - turn)[np.isfinite(slide)]
+        if len(difference):  # Photographs that show the part.
             error = difference.std() / math.sqrt(len(difference)) + 1e-12
             z = float(difference.mean() / error)
-            gain = float(difference.mean() / np.nanmean(slides[:, j]))
+            gain = float(difference.mean() / np.nanmean(slide))
         hinged = z > config.type_significance and gain > config.type_gain and float(reach[j]) < config.hinge_reach
         log.debug("joint %d: z %.1f, gain %.3f, reach %.2f", j + 1, z, gain, float(reach[j]))
         kinds.append("revolute" if hinged else "prismatic")
@@ -249,6 +263,12 @@ def _choose_types(
         certainty = z - config.type_significance if hinged else max(config.type_significance - z, 0.0)
         confidence[j] = 0.5 * (1 + math.erf(certainty / math.sqrt(2)))
     return kinds, confidence
+
+
+def _reach(g: Gaussians, poses: JointPoses) -> Tensor:
+    """(joints,) distance in extents from each part's centre to its joint's line."""
+    axis, offset = poses.axis().detach(), part_centres(g, len(poses.parents) + 1)[1:] - poses.pivot().detach()
+    return (torch.linalg.cross(offset, axis, dim=1).norm(dim=1) / poses.extent).cpu()
 
 
 def _standard_deviations(

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from hingesplat.labelling import label_costs
+from hingesplat.screw import matrix_to_screw
 from hingesplat.se3 import moved
 from hingesplat.search import Motion
 from hingesplat.surface import Labels, Surface, components
@@ -16,6 +17,10 @@ LEAST_SHARE = 0.001
 """Of each state's surface: a part that shows less of itself in one of them has no way from there to here."""
 TOUCH = 0.05
 """Extents between points of two parts that touch."""
+HINGE = 0.02
+"""Extents from its hinge line within which nothing tells whether a part is one."""
+LINKED = 0.25
+"""Links across a hinge line that make one part of what lies on both sides, for every point that it is long."""
 SURE = 0.4
 """A fragment that costs so much more with what it touches, on average, stays what it is."""
 
@@ -142,5 +147,32 @@ def _pieces(
     """Rows of one part's points in each state, and the connected piece of each, both states laid over each other."""
     rows = [np.flatnonzero(o == label) for o in owned]
     both = np.concatenate([moved(surfaces[0].points[rows[0]], T_1_0), surfaces[1].points[rows[1]]])
-    piece = components(both, max(0.025 * extent, 2.5 * spacing(both)), bridges=bridges)
+    radius = max(0.025 * extent, 2.5 * spacing(both))
+    piece = components(both, radius, bridges=bridges)
+    if not bridges:
+        gap = max(map(spacing, np.split(both, [len(rows[0])])))
+        piece = _cut_at_hinge(both, piece, T_1_0, radius, gap, extent)
     return rows, np.split(piece, [len(rows[0])])
+
+
+def _cut_at_hinge(
+    points: np.ndarray, piece: np.ndarray, T: np.ndarray, radius: float, gap: float, extent: float
+) -> np.ndarray:
+    """Pieces (n,) of points (n, 3) ``gap`` apart, in two where hardly more than their hinge line joins them.
+
+    Two doors back to back that open by the same angle share their motion, and a slit between them that is narrower than
+    the points are apart. A plate that turns about its middle is linked all along that line.
+    """
+    screw = matrix_to_screw(T)
+    far = np.linalg.norm(np.cross(points - screw.pivot, screw.axis), axis=1) > HINGE * extent
+    if screw.angle == 0 or not far.any():
+        return piece
+    cut = components(points[far], radius, bridges=False)[KDTree(points[far]).query(points)[1]]
+    size = np.bincount(cut)
+    if len(size) < 2:
+        return piece
+    first, second = (points[cut == p] for p in np.argsort(-size, kind="stable")[:2])
+    along = [side @ screw.axis for side in (first, second)]
+    shared = min(a.max() for a in along) - max(a.min() for a in along)
+    links = KDTree(first).count_neighbors(KDTree(second), 1.1 * gap)
+    return cut if links * gap < LINKED * shared else piece
