@@ -8,6 +8,7 @@ the place where its label says it went; Gaussians take that of the nearest point
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,9 @@ from hingesplat.search import BASE, Motion, ScoreVolume, carrier_of, inverted, n
 from hingesplat.stereo import DepthMap
 from hingesplat.surface import Surface, bounds, surface_of, thin
 from hingesplat.visibility import FREE, HIDDEN, ask
+
+ALIKE = 0.06
+"""Extents between the places to which two motions take their parts, in the mean, for one to be tried for both."""
 
 
 @dataclass(frozen=True)
@@ -193,10 +197,13 @@ def segment(
 
     def settled(candidates: list[Motion], price: float) -> list[Motion]:
         """Those of the candidates that there are, refined on what they own."""
+        shared: list[Motion] = []
         for _ in range(config.rounds):
+            candidates = [*candidates, *shared]
             kept, owned = problem.choose([m.T for m in candidates], price, parts)
             owners = [(rows[0][owned[0] == i + 1], rows[1][owned[1] == i + 1]) for i in range(len(kept))]
             candidates = [refit(evidence, candidates[k], own) for k, own in zip(kept, owners, strict=True)]
+            shared = one_for_two(evidence, candidates, owners)
         return candidates
 
     chosen = settled(chosen, config.part_cost)
@@ -219,6 +226,24 @@ def segment(
     unexplained = float((costs.min(1) >= config.explained_cost).mean())
     labels = tuple(spread_labels(gaussians[s].means.numpy(), surfaces[s], owned[s]) for s in (0, 1))
     return Segmentation((labels[0], labels[1]), tuple(chosen), unexplained, n_seeds)
+
+
+def one_for_two(
+    evidence: Evidence, motions: Sequence[Motion], owners: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> list[Motion]:
+    """For every two motions that nearly agree on what they own, rows of each state's points: one refined on both.
+
+    A part whose true motion was not among those tried may be shared by one on either side of it.
+    """
+    shared = []
+    for i, j in combinations(range(len(motions)), 2):
+        both = tuple(np.concatenate(rows) for rows in zip(owners[i], owners[j], strict=True))
+        points = evidence.surfaces[0].points[both[0]]
+        ends = moved(points, motions[i].T) - moved(points, motions[j].T)
+        if len(points) and np.linalg.norm(ends, axis=1).mean() < ALIKE * evidence.extent:
+            larger = max((i, j), key=lambda k: sum(map(len, owners[k])))
+            shared.append(refit(evidence, motions[larger], (both[0], both[1])))
+    return shared
 
 
 def segment_states(
