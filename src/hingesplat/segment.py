@@ -57,7 +57,7 @@ class SegmentConfig:
     """Seeds of each state that judge the hypotheses."""
     explained_cost: float = 0.8
     """A seed that a motion explains worse than this counts as unexplained."""
-    part_cost: float = 45.0
+    part_cost: float = 50.0
     """Description length of one more part, in points (a point stands for 0.03² of the extent's square)."""
     hanging_cost: float = 22.0
     """The same where something is left that no joint on the base explains: parts that hang on others are small."""
