@@ -103,10 +103,11 @@ def test_a_drawer_whose_back_was_seen_ends_there() -> None:
     assert solid_at(drawn_out(grid(), narrow, BACK, [np.eye(4), OUT], (0.02, 0.04)), 0, 0.6, 0)
 
 
-def test_a_flat_part_has_no_section() -> None:
+@pytest.mark.parametrize("way", [[1, 0, 0], [0, -1, 0]])
+def test_a_flat_part_has_no_section(way: list[float]) -> None:
     plate = tray(0.15)[:1600]
     part = grid()
-    assert drawn_out(part, plate, BACK, [np.eye(4), prismatic([1, 0, 0], 0.3)], (0.02, 0.04)) is part
+    assert drawn_out(part, plate, BACK, [np.eye(4), prismatic(way, 0.3)], (0.02, 0.04)) is part
 
 
 def test_a_bottom_that_was_always_hidden_is_there_and_an_open_top_stays_open() -> None:

@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
-from typing import Literal
+from types import SimpleNamespace
+from typing import Any, Literal, cast
 
 import numpy as np
 import pytest
@@ -16,7 +17,16 @@ from hingesplat.render import render
 from hingesplat.screw import prismatic, revolute
 from hingesplat.se3 import moved
 from hingesplat.search import Motion, inverted
-from hingesplat.segment import SegmentConfig, floating, segment, segment_states, spread_labels, survey, track
+from hingesplat.segment import (
+    SegmentConfig,
+    floating,
+    one_for_two,
+    segment,
+    segment_states,
+    spread_labels,
+    survey,
+    track,
+)
 from hingesplat.stereo import Cloud, DepthMap, StereoConfig, depth_map, stereo
 from hingesplat.surface import Surface, bounds, components, surface_of, thin
 from hingesplat.visibility import FREE, HIDDEN, SURFACE, Sight, ask
@@ -479,6 +489,19 @@ def test_two_doors_on_one_hinge_line_are_two_parts_and_a_plate_on_its_middle_is_
 
 SHIFT = Motion("prismatic", np.eye(3)[2], np.zeros(3), 0.5, 1.0)
 BASE, PART = patch((0, 0, -1), 20), patch((0, 0, 0))
+
+
+def test_two_motions_that_nearly_agree_are_tried_as_one_on_what_both_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A small door once had two, each a little off to its own side."""
+    asked = []
+    monkeypatch.setattr("hingesplat.segment.refit", lambda _, motion, own: asked.append((motion, own)) or motion)
+    half, other = (Motion("prismatic", np.eye(3)[2], np.zeros(3), value, 1.0) for value in (0.5, 0.53))
+    far = Motion("prismatic", np.eye(3)[0], np.zeros(3), 0.5, 1.0)
+    evidence = cast(Any, SimpleNamespace(surfaces=(plain(PART), plain(PART)), extent=1.0))
+    owners = [(np.arange(10), np.arange(5)), (np.arange(10, 30), np.arange(5, 9)), (np.arange(30, 40), np.arange(0))]
+    assert one_for_two(evidence, [half, other, far], owners) == [other]
+    ((motion, own),) = asked
+    assert motion is other and [rows.tolist() for rows in own] == [list(range(30)), list(range(9))]
 
 
 def both_states(*parts: tuple[np.ndarray, Motion]) -> tuple[Surface, Surface]:

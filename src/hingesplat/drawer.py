@@ -98,7 +98,7 @@ def drawn_out(
             continue
         covered = _outline(front @ across.T)  # A drawer's box is behind its front.
         box = surface[covered.find_simplex(surface @ across.T) >= 0]
-        section = _section(part, box, inwards, covered, own)
+        section = _section(part, box, inwards, covered, own) if len(box) else None
         if section is None:
             continue
         start, outline = section.start, section.outline
@@ -111,10 +111,7 @@ def drawn_out(
         inside = box[(box @ inwards > start) & _inner(outline, box @ across.T)]
         for back in np.arange(end, start, -own):  # Its own back, if that was seen.
             face = inside[np.abs(inside @ inwards - back) < own / 2]
-            if (
-                len(face) >= FEWEST
-                and np.ptp(face @ across.T, axis=0).max() > SPAN * np.ptp(outline.points, axis=0).max()
-            ):
+            if len(face) >= FEWEST and _widest(face @ across.T) > SPAN * _widest(outline.points):
                 end = float(np.median(face @ inwards)) + own
                 break
         if end > start + 2 * own:
@@ -140,6 +137,11 @@ def _largest(points: np.ndarray, radius: float) -> np.ndarray:
 def _narrowest(flat: np.ndarray) -> float:
     """Extent of points (n, 2) along their shorter principal axis."""
     return float(np.ptp(np.linalg.svd(flat - flat.mean(0), full_matrices=False)[2] @ flat.T, axis=1).min())
+
+
+def _widest(flat: np.ndarray) -> float:
+    """Extent of points (n, 2) along the axis along which it is the larger."""
+    return float(np.ptp(flat, axis=0).max())
 
 
 def _outline(flat: np.ndarray) -> Delaunay:
@@ -177,7 +179,7 @@ class _Section:
 def _section(
     part: DistanceGrid, surface: np.ndarray, inwards: np.ndarray, covered: Delaunay, wall: float
 ) -> _Section | None:
-    """The median of all slices behind the front; None if that is full, or too little of it was seen.
+    """The median of all slices behind the front; None if it is narrow or full, or too little was seen of its hollow.
 
     Args:
         surface: (n, 3) points that were seen of it, behind and in its front, whose outline across is ``covered``.
