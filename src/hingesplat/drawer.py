@@ -188,7 +188,7 @@ def _section(
     across, lower = axes_across(inwards), covered.points.min(0) - MARGIN * part.voxel
     shape = np.ceil(np.ptp(covered.points, axis=0) / part.voxel).astype(int) + 1 + 2 * MARGIN
     cells = lower + part.voxel * np.indices(shape).reshape(2, -1).T
-    depths = np.arange((surface @ inwards).min(), (surface @ inwards).max(), part.voxel)
+    depths = np.arange((surface @ inwards).min(), (surface @ inwards).max() + part.voxel, part.voxel)
     places = depths[:, None, None] * inwards + cells @ across
     index = ((places - part.lower) / part.voxel).reshape(-1, 3).T
     distance = ndimage.map_coordinates(part.distance, index, order=1, cval=1.0).reshape(len(depths), -1)
@@ -199,6 +199,8 @@ def _section(
     solid = known & (distance < 0)
     full = solid[:, covered.find_simplex(cells) >= 0].mean(1) > FULL
     behind = slice(int(np.flatnonzero(full).max(initial=-1)) + 1, None)
+    if not len(depths[behind]):
+        return None
     seen = known[behind].sum(0)
     often = seen > OFTEN * max(int(seen.max(initial=0)), 1)
     profile = np.ones(len(cells))
