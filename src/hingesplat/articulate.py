@@ -26,7 +26,7 @@ from hingesplat.poses import (
 )
 from hingesplat.slots import SlotsConfig, living_slots
 from hingesplat.stereo import DepthMap
-from hingesplat.training import Report, TrainingView, averaged, grow, shuffled, training_views
+from hingesplat.training import Report, TrainingView, averaged, grow, shuffled, thinned, training_views
 
 JUDGES, BETTER = 25, 0.9
 """Photographs of a state that say whether an alignment has made things better, and the share of the error that may be
@@ -164,11 +164,10 @@ def _align(
     not taken on the colours of a wrong pose. A part goes back to where it was if photographs do not like it better, or
     hardly so and its surface comes off that of the ``fitted`` Gaussians: the insides of a door, unseen so far, draw it.
     """
-    some = [state[:: max(len(state) // JUDGES, 1)] for state in training]
     (R, t), off = poses.Rt(), _misfits(canonical, poses, fitted, extent)
     steps, rate = config.align_steps, config.align_rate
     move_parts_alone(canonical, poses, training, steps, rate, config.render.ssim_weight, rng, end=0.1)
-    before, after = _mean_errors(canonical, [(R, t), poses.Rt()], some)
+    before, after = _mean_errors(canonical, [(R, t), poses.Rt()], thinned(training, JUDGES))
     still_on = _misfits(canonical, poses, fitted, extent) < off + ASTRAY
     good = (after < BETTER * before) | ((after < before) & still_on)
     with torch.no_grad():

@@ -188,6 +188,7 @@ def _section(
     across, lower = axes_across(inwards), covered.points.min(0) - MARGIN * part.voxel
     shape = np.ceil(np.ptp(covered.points, axis=0) / part.voxel).astype(int) + 1 + 2 * MARGIN
     cells = lower + part.voxel * np.indices(shape).reshape(2, -1).T
+    behind_front = covered.find_simplex(cells) >= 0
     depths = np.arange((surface @ inwards).min(), (surface @ inwards).max() + part.voxel, part.voxel)
     places = depths[:, None, None] * inwards + cells @ across
     index = ((places - part.lower) / part.voxel).reshape(-1, 3).T
@@ -197,7 +198,7 @@ def _section(
     guess = np.nonzero(~known & (distance < 0))
     known[guess] = np.isfinite(KDTree(surface).query(places[guess], distance_upper_bound=wall)[0])
     solid = known & (distance < 0)
-    full = solid[:, covered.find_simplex(cells) >= 0].mean(1) > FULL
+    full = solid[:, behind_front].mean(1) > FULL
     behind = slice(int(np.flatnonzero(full).max(initial=-1)) + 1, None)
     if not len(depths[behind]):
         return None
@@ -205,7 +206,7 @@ def _section(
     often = seen > OFTEN * max(int(seen.max(initial=0)), 1)
     profile = np.ones(len(cells))
     profile[often] = np.nanmedian(np.where(known, distance, np.nan)[behind][:, often], axis=0)
-    profile[covered.find_simplex(cells) < 0] = 1
+    profile[~behind_front] = 1
     profile = ndimage.grey_opening(profile.reshape(shape), 5).ravel()  # Narrow gaps are none.
     walls = profile < 0
     if walls.sum() < FEWEST or _narrowest(cells[walls]) < 3 * wall:

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -28,7 +28,7 @@ from hingesplat.screw import axes_across
 from hingesplat.se3 import rotvec_to_matrix
 from hingesplat.stereo import DepthMap
 from hingesplat.symmetry import round_about
-from hingesplat.training import Report, TrainingView, averaged, shuffled, training_views
+from hingesplat.training import Report, TrainingView, averaged, shuffled, thinned, training_views
 from hingesplat.twin import Joint, JointStd, JointType
 
 log = logging.getLogger(__name__)
@@ -225,7 +225,7 @@ def _choose_types(
     each is judged with the others as they are likely to be: a wrong type carries a part before its neighbours.
     """
     weight, tried = config.render.ssim_weight, []
-    far = torch.zeros(n_joints, dtype=torch.bool)
+    far = np.zeros(n_joints, bool)
     for kind in ("prismatic", "revolute"):
         poses = poses_of([kind] * n_joints)
         if kind == "revolute":
@@ -233,31 +233,18 @@ def _choose_types(
             poses = poses_of(["prismatic" if slides else "revolute" for slides in far])
         move_parts_alone(g, poses, training, config.type_steps, config.rate, weight, rng, state_sh=sh)
         tried.append([x.detach() for x in poses.Rt()])
-    reach, some = _reach(g, poses), [state[:: max(len(state) // JUDGES, 1)] for state in training]
-    slides, turns = np.nansum(errors_by_part(g, tried, some, sh), axis=1)
-    likely = (turns < slides) & ~far.numpy()
-
-    def mixed(turning: np.ndarray) -> tuple[Tensor, Tensor]:
-        """Poses in which these joints turn, and the others slide."""
-        part = torch.tensor([False, *turning]).to(g.means.device)
-        (R0, t0), (R1, t1) = tried
-        return torch.where(part[:, None, None], R1, R0), torch.where(part[:, None], t1, t0)
-
-    one_other = (likely ^ np.eye(n_joints, dtype=bool)) & ~far.numpy()
-    as_likely, *otherwise = errors_by_part(g, [mixed(turning) for turning in (likely, *one_other)], some, sh)
+    reach = _reach(g, poses)
     kinds: list[JointType] = []
     confidence = np.zeros(n_joints)
-    for j in range(n_joints):
+    for j, (slide, turn) in enumerate(_beside_likely(g, sh, thinned(training, JUDGES), tried, ~far)):
         z = gain = 0.0
-        pair = [as_likely[:, j], otherwise[j][:, j]]
-        slide, turn = reversed(pair) if likely[j] else pair
-        difference = (slide - turn)[np.isfinite(slide)]
-        if len(difference):  # Photographs that show the part.
+        if len(slide):  # Photographs that show the part.
+            difference = slide - turn
             error = difference.std() / math.sqrt(len(difference)) + 1e-12
             z = float(difference.mean() / error)
-            gain = float(difference.mean() / np.nanmean(slide))
-        hinged = z > config.type_significance and gain > config.type_gain and float(reach[j]) < config.hinge_reach
-        log.debug("joint %d: z %.1f, gain %.3f, reach %.2f", j + 1, z, gain, float(reach[j]))
+            gain = float(difference.mean() / slide.mean())
+        hinged = z > config.type_significance and gain > config.type_gain and reach[j] < config.hinge_reach
+        log.debug("joint %d: z %.1f, gain %.3f, reach %.2f", j + 1, z, gain, reach[j])
         kinds.append("revolute" if hinged else "prismatic")
         # An even verdict between nested models speaks for the slide.
         certainty = z - config.type_significance if hinged else max(config.type_significance - z, 0.0)
@@ -265,10 +252,40 @@ def _choose_types(
     return kinds, confidence
 
 
-def _reach(g: Gaussians, poses: JointPoses) -> Tensor:
+def _beside_likely(
+    g: Gaussians,
+    sh: Tensor,
+    training: Sequence[Sequence[TrainingView]],
+    tried: Sequence[tuple[Tensor, Tensor]],
+    may_turn: np.ndarray,
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """For every joint, errors (photographs,) where it slides and where it turns, with the others of likely types.
+
+    Args:
+        tried: poses R, t in which all slide, and in which those of ``may_turn`` (joints,) turn.
+    """
+    slides, turns = np.nansum(errors_by_part(g, tried, training, sh), axis=1)
+    likely = (turns < slides) & may_turn
+
+    def mixed(turning: np.ndarray) -> tuple[Tensor, Tensor]:
+        """Poses in which these joints turn, and the others slide."""
+        part = torch.tensor([False, *turning]).to(g.means.device)
+        (R0, t0), (R1, t1) = tried
+        return torch.where(part[:, None, None], R1, R0), torch.where(part[:, None], t1, t0)
+
+    one_other = (likely ^ np.eye(len(likely), dtype=bool)) & may_turn
+    as_likely, *otherwise = errors_by_part(g, [mixed(turning) for turning in (likely, *one_other)], training, sh)
+    for j, other in enumerate(otherwise):
+        pair = np.stack([as_likely[:, j], other[:, j]])
+        slide, turn = pair[::-1] if likely[j] else pair
+        shown = np.isfinite(slide)
+        yield slide[shown], turn[shown]
+
+
+def _reach(g: Gaussians, poses: JointPoses) -> np.ndarray:
     """(joints,) distance in extents from each part's centre to its joint's line."""
     axis, offset = poses.axis().detach(), part_centres(g, len(poses.parents) + 1)[1:] - poses.pivot().detach()
-    return (torch.linalg.cross(offset, axis, dim=1).norm(dim=1) / poses.extent).cpu()
+    return (torch.linalg.cross(offset, axis, dim=1).norm(dim=1) / poses.extent).cpu().numpy()
 
 
 def _standard_deviations(

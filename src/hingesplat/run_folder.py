@@ -55,7 +55,7 @@ def load_result(folder: Path) -> tuple[Gaussians, Twin]:
 
 def capture_of(folder: Path) -> Path | None:
     """The capture that a run was made from; None where it is gone."""
-    known = _config_of(folder).get("capture")
+    known = read_record(folder / "config.json").get("capture")
     return Path(known) if isinstance(known, str) and Path(known).is_dir() else None
 
 
@@ -68,15 +68,12 @@ def up_of(folder: Path) -> np.ndarray | None:
 
 def repel_points_of(folder: Path) -> np.ndarray:
     """Repel points (n, 3) as ``articulate`` draws them, where a run used them; else none."""
-    told, path = _config_of(folder).get("articulate", {}).get("repel"), folder / "canonical.safetensors"
+    told = read_record(folder / "config.json").get("articulate", {}).get("repel")
+    path = folder / "canonical.safetensors"
     drawn = None
     if isinstance(told, dict) and path.is_file():
         drawn = draw_repel_points(Gaussians.load(path), RepelConfig(**told), torch.Generator().manual_seed(0))
     return np.zeros((0, 3), np.float32) if drawn is None else drawn.numpy()
-
-
-def _config_of(folder: Path) -> dict[str, Any]:
-    return read_record(folder / "config.json")
 
 
 def load_meshes(folder: Path, twin: Twin) -> dict[int, trimesh.Trimesh]:
@@ -154,7 +151,7 @@ def take_over(folder: Path, parents: Sequence[Path], inherited: Inherited) -> No
     ``inherited`` names the stages that may be taken over, in order, each with the options that decide its results
     beside those of the stages before, and its files.
     """
-    wanted = flat(_config_of(folder))
+    wanted = flat(read_record(folder / "config.json"))
     shared = {parent: _stages_shared(parent, wanted, inherited) for parent in parents}
     best = max(shared, key=lambda parent: len(shared[parent]), default=None)
     if best is None or not shared[best] or (folder / "stages.json").is_file():
@@ -170,7 +167,7 @@ def take_over(folder: Path, parents: Sequence[Path], inherited: Inherited) -> No
 
 def _stages_shared(parent: Path, wanted: dict[str, Any], inherited: Inherited) -> list[str]:
     """The first stages of a run that the same photographs and options would make again."""
-    known = flat(_config_of(parent))
+    known = flat(read_record(parent / "config.json"))
     finished = read_record(parent / "stages.json")
     shared = []
     for name, (options, _) in inherited.items():

@@ -159,6 +159,11 @@ def view_loss(
     return loss, error
 
 
+def thinned(states: Sequence[Sequence[TrainingView]], about: int) -> list[Sequence[TrainingView]]:
+    """Evenly spread photographs of every state, ``about`` so many of each, to judge by."""
+    return [state[:: max(len(state) // about, 1)] for state in states]
+
+
 def shuffled(states: Sequence[Sequence[TrainingView]], rng: np.random.Generator) -> Iterator[tuple[int, TrainingView]]:
     """Every photograph of every state, with its state's index, in a new order each round, for ever."""
     everything = [(s, view) for s, state in enumerate(states) for view in state]
