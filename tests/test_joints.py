@@ -10,10 +10,11 @@ import torch
 from torch.autograd import gradcheck
 
 from hingesplat.chains import closest_joint, parents_of
-from hingesplat.joints import JointPoses, JointResult, JointsConfig, _joints, find_joints
+from hingesplat.joints import JointPoses, JointResult, JointsConfig, _joints, _shared_errors, find_joints
 from hingesplat.poses import part_centres
 from hingesplat.render import move
 from hingesplat.screw import line_distance, prismatic, revolute
+from hingesplat.training import TrainingView
 from hingesplat.twin import Joint, JointType, Part, Twin
 from scenes import (
     ANGLE,
@@ -21,6 +22,7 @@ from scenes import (
     FORWARD,
     PIVOT,
     SLIDE,
+    look_at,
     one_thread,  # noqa: F401
     scene,
 )
@@ -193,7 +195,7 @@ def test_a_joint_that_was_refined_backwards_is_turned_round() -> None:
     values = np.array([[0.2], [-0.9]])
     for kind in ("revolute", "prismatic"):
         p = JointPoses([kind], SLANT[None], POINT[None], values, 1.0)
-        (joint,) = _joints([kind], p, made.gaussians, np.ones(1), None, np.ones(1, int), 1, 0.01)
+        (joint,) = _joints([kind], p, made.gaussians, np.ones(1), None, np.ones(1, int), 1)
         np.testing.assert_allclose(joint.states, [0, -0.2, 0.9], atol=1e-6)
         np.testing.assert_allclose(joint.limits, [-0.2, 0.9], atol=1e-6)
         for state, value in enumerate([0.0, 0.2, -0.9]):
@@ -221,12 +223,11 @@ def test_no_joint_is_surer_than_a_part_of_a_pixel(kind: Kind) -> None:
     axis, pivot, value = (AXIS, PIVOT, ANGLE) if kind == "revolute" else (FORWARD, np.zeros(3), SLIDE)
     p = JointPoses([kind], np.asarray(axis)[None], np.asarray(pivot)[None], np.array([[value]]), 1.0)
     coarse, fine = (
-        _joints([kind], p, made.gaussians, np.ones(1), np.zeros((1, 5)), np.ones(1, int), 1, pixel)[0].std
-        for pixel in (0.02, 0.01)
+        np.sqrt(np.diag(_shared_errors(made.gaussians, [[TrainingView(camera, np.zeros((1, 1, 4), np.uint8))]], p)[0]))
+        for camera in (look_at(np.array([0.0, -3.0, 1.0]), size) for size in (60, 120))
     )
-    assert coarse.axis_deg and fine.axis_deg and coarse.axis_deg == pytest.approx(2 * fine.axis_deg)
-    assert coarse.motion and fine.motion and coarse.motion == pytest.approx(2 * fine.motion)
-    assert (coarse.pivot is None) == (kind == "prismatic") and 0.0005 <= fine.motion <= 0.02
+    np.testing.assert_allclose(coarse, 2 * fine)
+    assert 0.0005 <= fine[4] <= 0.02
 
 
 def test_deviations_can_be_skipped_and_the_seed_decides() -> None:

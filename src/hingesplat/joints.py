@@ -4,6 +4,7 @@ import logging
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from hingesplat.capture import View
 from hingesplat.chains import closest_joint, parents_of
 from hingesplat.gaussians import Gaussians
 from hingesplat.optim import GaussianAdam, LearningRates
+from hingesplat.patches import PatchConfig, Photograph, adjust, patches_of
 from hingesplat.poses import (
     StateLossConfig,
     drawn_parts,
@@ -38,6 +40,8 @@ JUDGES = 50
 ACROSS, ALONG = 0.17, 0.065
 """Errors that all photographs share (a label, a highlight), in pixels on the object: of places across a hinge line and
 turns about it, and of directions and slides. Taken from the made objects of docs/results.md."""
+LEFT = 0.4
+"""Share of these errors that patches leave."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +57,12 @@ class JointsConfig:
     hinge_reach: float = 1.0
     """A hinge line farther than this from its part, in extents, is a slide in disguise."""
     steps: int = 500
-    """Steps of the constrained refinement, everything together."""
+    """Steps of the constrained refinement, joints and Gaussians together."""
     rate: float = 1e-3
     """Adam step of the joint parameters (radians, extents) at the start; decays to 2 %."""
+    patches: PatchConfig = field(default_factory=PatchConfig)
+    settled: float = 0.3
+    """Share of the steps left for Gaussians alone, once patches have settled the joints."""
     uncertainty_views: int = 12
     """Photographs of each moved state from which standard deviations are made; 0 skips them."""
     render: StateLossConfig = field(default_factory=StateLossConfig)
@@ -130,6 +137,25 @@ class JointPoses:
         R, t = torch.cat([eye, R], 1), torch.cat([t.new_zeros((len(value), 1, 3)), t], 1)
         return self._on_parents(R, t) if any(self.parents) else (R, t)
 
+    @torch.no_grad()
+    def place(self, joint: int, theta: np.ndarray) -> np.ndarray:
+        """T_state_0 (states, 4, 4) of a joint's part if the joint's row of ``theta`` were this one."""
+        own = self.theta[joint].clone()
+        self.theta[joint] = torch.from_numpy(theta).to(self.theta)
+        R, t = self.Rt()
+        self.theta[joint] = own
+        T = np.tile(np.eye(4), (len(R), 1, 1))
+        T[:, :3, :3], T[:, :3, 3] = R[:, joint + 1].cpu().numpy(), t[:, joint + 1].cpu().numpy()
+        return T
+
+    def parents_first(self) -> list[int]:
+        """Joints in an order in which none comes before the one that it hangs on."""
+
+        def depth(part: int) -> int:
+            return 0 if part == 0 else 1 + depth(self.parents[part - 1])
+
+        return sorted(range(len(self.parents)), key=lambda joint: depth(joint + 1))
+
     def _on_parents(self, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
         """Every part's motion carried along by that of its parent."""
         chained = {0: (R[:, 0], t[:, 0])}
@@ -190,23 +216,34 @@ def find_joints(
     adam = torch.optim.Adam(poses.parameters, lr=config.rate)
     photographs = shuffled(training, rng)
     tell = averaged(report, config.steps)
-    for step in range(config.steps):
-        progress = step / config.steps
-        state, view = next(photographs)
-        R, t = poses.Rt()
-        loss, error = state_loss(optimiser, R[state], t[state], view, state, config.render, extent)
-        loss.backward()
-        optimiser.step(progress)
-        pose_step(adam, config.rate, progress)
-        tell(loss, error, len(optimiser))
-    finished = optimiser.gaussians.detached()
-    offsets = optimiser.values["state_sh"].detach().permute(1, 0, 2)
-    all_sh = torch.cat([torch.zeros_like(offsets[:1]), offsets]).contiguous()
-    deviation = _standard_deviations(finished, all_sh, training, poses, config)
+
+    def refine(steps: range, joints_too: bool) -> tuple[Gaussians, Tensor]:
+        for step in steps:
+            state, view = next(photographs)
+            R, t = poses.Rt()
+            if not joints_too:
+                R, t = R.detach(), t.detach()
+            loss, error = state_loss(optimiser, R[state], t[state], view, state, config.render, extent)
+            loss.backward()
+            optimiser.step(step / config.steps)
+            if joints_too:
+                pose_step(adam, config.rate, step / steps.stop)
+            tell(loss, error, len(optimiser))
+        offsets = optimiser.values["state_sh"].detach().permute(1, 0, 2)
+        return optimiser.gaussians.detached(), torch.cat([torch.zeros_like(offsets[:1]), offsets]).contiguous()
+
+    together = round((1 - config.settled if config.patches.per_part else 1) * config.steps)
+    finished, all_sh = refine(range(together), joints_too=True)
+    covariance = _shared_errors(finished, training, poses)
+    if config.uncertainty_views:
+        covariance += _covariances(finished, all_sh, training, poses, config)
+    if config.patches.per_part:
+        covariance = _by_patches(finished, training, poses, covariance, config.patches, rng)
+    finished, all_sh = refine(range(together, config.steps), joints_too=False)
     seen = _views_that_show(finished, training, poses)
     finished, all_sh = finished.to("cpu"), all_sh.cpu()
-    pixel = float(np.median([_pixel(v.camera, finished) for state in training for v in state]))
-    joints = _joints(kinds, poses, finished, confidence, deviation, seen, sum(len(s) for s in training), pixel)
+    deviation = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)) if config.uncertainty_views else None
+    joints = _joints(kinds, poses, finished, confidence, deviation, seen, sum(len(s) for s in training))
     return JointResult(finished, all_sh, joints)
 
 
@@ -288,16 +325,60 @@ def _reach(g: Gaussians, poses: JointPoses) -> np.ndarray:
     return (torch.linalg.cross(offset, axis, dim=1).norm(dim=1) / poses.extent).cpu().numpy()
 
 
-def _standard_deviations(
+def _by_patches(
+    g: Gaussians,
+    training: Sequence[Sequence[TrainingView]],
+    poses: JointPoses,
+    covariance: np.ndarray,
+    config: PatchConfig,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Settle ``poses`` by the texture of the parts, as far as that tells more than is known; what is known then.
+
+    ``covariance`` (joints, p, p), of what is known and of what comes out, is that of the rows of ``theta``.
+    """
+    photographs = []
+    for state, views in enumerate(thinned(training, config.views)):
+        R, t = (x[state : state + 1].detach() for x in poses.Rt())
+        photographs.append([Photograph.of(view.camera, view.image, r) for view, r in drawn_parts(g, R, t, [views])])
+    settled, left = covariance.copy(), LEFT**2 * _shared_errors(g, training, poses)
+    for j in poses.parents_first():
+        patches = patches_of(j + 1, photographs[0], config, rng)
+        if patches is not None:
+            start = poses.theta[j].detach().cpu().double().numpy()
+            theta, settled[j] = adjust(
+                patches, photographs, partial(poses.place, j), start, np.linalg.inv(covariance[j]), poses.extent, config
+            )
+            settled[j] += left[j]
+            with torch.no_grad():
+                poses.theta[j] = torch.from_numpy(theta).to(poses.theta)
+    return settled
+
+
+def _shared_errors(g: Gaussians, training: Sequence[Sequence[TrainingView]], poses: JointPoses) -> np.ndarray:
+    """(joints, 4 + states − 1, 4 + states − 1) covariance of ``theta`` by what all photographs get wrong alike."""
+    pixel = float(np.median([_pixel(v.camera, g) for state in training for v in state])) / poses.extent
+    axes, pivots = (x.detach().cpu().double().numpy() for x in (poses.axis(), poses.pivot()))
+    variance = np.zeros(poses.theta.shape)
+    for j, turns in enumerate(poses.revolute.tolist()):
+        points = g.means[g.part == j + 1].cpu().double().numpy()
+        spread = math.sqrt(points.var(0).sum()) / poses.extent if len(points) else 1.0
+        across = np.linalg.norm(np.cross(points - pivots[j], axes[j]), axis=1) / poses.extent
+        lever = math.sqrt(np.mean(across**2)) if len(points) else spread
+        variance[j, :2] = (ALONG * pixel / spread) ** 2 / 2
+        variance[j, 2:4] = (ACROSS * pixel) ** 2 / 2
+        variance[j, 4:] = (ACROSS * pixel / max(lever, 1e-9) if turns else ALONG * pixel) ** 2
+    return variance[:, :, None] * np.eye(variance.shape[1])
+
+
+def _covariances(
     g: Gaussians, sh: Tensor, training: Sequence[Sequence[TrainingView]], poses: JointPoses, config: JointsConfig
-) -> np.ndarray | None:
-    """(joints, 4 + states − 1) standard deviation of ``theta``: the sandwich H⁻¹ (Σ g gᵀ) H⁻¹ over photographs.
+) -> np.ndarray:
+    """(joints, 4 + states − 1, 4 + states − 1) covariance of ``theta``: the sandwich H⁻¹ (Σ g gᵀ) H⁻¹ of photographs.
 
     H is the curvature of the summed photometric loss (finite differences of its gradient, joints independent of each
     other); g are single photographs' gradients, whose scatter tells how far they disagree.
     """
-    if config.uncertainty_views == 0:
-        return None
     chosen = [
         (s, i)
         for s in range(1, len(training))
@@ -325,7 +406,7 @@ def _standard_deviations(
             H[:, k] += sign * gradients().sum(0) / (2 * step)
             with torch.no_grad():
                 poses.theta[:, k] -= sign * step
-    deviation = np.zeros(poses.theta.shape)
+    covariance = np.zeros_like(H)
     for j in range(len(H)):
         symmetric = (H[j] + H[j].T) / 2
         value, vector = np.linalg.eigh(symmetric)
@@ -333,9 +414,8 @@ def _standard_deviations(
         keep = value > 1e-3 * value.max()
         inverse = (vector[:, keep] / value[keep]) @ vector[:, keep].T
         scatter = np.einsum("vi,vj->ij", at[:, j], at[:, j])
-        covariance = inverse @ scatter @ inverse * len(chosen) / n_views
-        deviation[j] = np.sqrt(np.maximum(np.diag(covariance), 0))
-    return deviation
+        covariance[j] = inverse @ scatter @ inverse * len(chosen) / n_views
+    return covariance
 
 
 def _views_that_show(g: Gaussians, training: Sequence[Sequence[TrainingView]], poses: JointPoses) -> np.ndarray:
@@ -366,9 +446,8 @@ def _joints(
     deviation: np.ndarray | None,
     seen: np.ndarray,
     n_views: int,
-    pixel: float,
 ) -> tuple[Joint, ...]:
-    """``pixel`` is the size of a photograph's pixel on the object, scene units."""
+    """What is written down; ``deviation`` (joints, 4 + states − 1) is the standard deviation of ``theta``."""
     axes, pivots = (x.detach().cpu().double().numpy() for x in (poses.axis(), poses.pivot()))
     values = poses.values().detach().cpu().double().numpy()
     centroids = part_centres(g, len(kinds) + 1).double().numpy()[1:]
@@ -382,14 +461,9 @@ def _joints(
         points = g.means[g.part == j + 1].double().numpy()
         if deviation is not None:
             d = deviation[j]
-            spread = math.sqrt(points.var(0).sum()) if len(points) else poses.extent
-            across = np.linalg.norm(np.cross(points - pivot, axis), axis=1) if len(points) else np.full(1, spread)
-            axis_deg = math.degrees(math.hypot(d[0], d[1], ALONG * pixel / spread))
-            systematic = (
-                ACROSS * pixel / max(math.sqrt(np.mean(across**2)), 1e-9) if kind == "revolute" else ALONG * pixel
-            )
-            motion = math.hypot(float(d[4:].max()) * float(poses.unit[j]), systematic)
-            place = math.hypot(math.hypot(d[2], d[3]) * poses.extent, ACROSS * pixel) if kind == "revolute" else None
+            axis_deg = math.degrees(math.hypot(d[0], d[1]))
+            motion = float(d[4:].max()) * float(poses.unit[j])
+            place = math.hypot(d[2], d[3]) * poses.extent if kind == "revolute" else None
             std = JointStd(axis_deg, place, motion)
             words = f"axis ±{axis_deg:.2g}°, "
         joints.append(

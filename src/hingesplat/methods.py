@@ -39,8 +39,9 @@ def _without_search(config: ReconstructConfig, method: MethodName, start: StartC
         method=method,
         start=start,
         articulate=replace(config.articulate, pose_rate=rate, frame="first" if method == "vanilla" else "between"),
-        # The joint as a constraint on the last refinement is ours; types and standard deviations are not held back.
-        joints=replace(config.joints, steps=0),
+        # The joint as a constraint on the last refinement is ours, and so are patches; types and standard deviations
+        # are not held back.
+        joints=replace(config.joints, steps=0, patches=replace(config.joints.patches, per_part=0)),
     )
 
 

@@ -1,0 +1,340 @@
+"""Where a part is, by its texture: small patches of its surface matched over all photographs of all states.
+
+Gaussians are fuzz about a pixel thick, and a joint follows where the fuzz leans. A patch is a plane with one texture:
+its own depth and tilt and the part's joint are adjusted together until all photographs show the same texture there, up
+to light: a patch's level, slopes and contrast are left out. That is bundle adjustment (Triggs et al., 2000) with
+normalised intensities for residuals; the patches' own numbers are eliminated (Schur complement).
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+from torch import Tensor
+
+from hingesplat.camera import Camera
+from hingesplat.render import Rendering
+from hingesplat.screw import axes_across
+from hingesplat.se3 import moved
+from hingesplat.surface import thin
+
+LEAST_FACING = 0.4
+"""Cosine between a patch's normal and the way to a camera that may judge it."""
+AGREES, DISAGREES = 0.8, 0.6
+"""Correlation with its patch's texture from which a photograph counts fully, and below which it does not."""
+FEWEST = 3
+"""Photographs of a state that must show a patch."""
+CONTRAST, NOISE = 0.005, 0.003
+"""Least standard deviation of a patch's intensities; least variance of normalised ones about their texture."""
+DEEP, TILTED = 1.2, 0.3
+"""How far patches lie off the drawn surface, in pixels, and how much they tilt, as a slope: standard deviations."""
+NEAR = 0.015
+"""Extents from the drawn surface within which a patch is on it."""
+ALIKE = 4.0
+"""Patches side by side err alike: so many count as one in standard deviations."""
+STEP = 1e-3
+"""For derivatives of poses, radians and extents."""
+
+
+@dataclass(frozen=True)
+class PatchConfig:
+    """Matching patches of the parts' surfaces."""
+
+    per_part: int = 1000
+    """Patches of each part, at most; 0 leaves joints as the Gaussians have them."""
+    width: int = 9
+    """Of a patch, in pixels."""
+    views: int = 50
+    """Photographs of each state that are matched, at most."""
+    rounds: int = 5
+    """Of Gauss-Newton."""
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A photograph, and what the model says is to be seen in it."""
+
+    camera: Camera
+    spline: np.ndarray
+    """(h, w) float32: coefficients of the cubic spline through its grey values."""
+    slope: np.ndarray
+    """(2, h, w) float32: how grey values change along x and y, a pixel."""
+    depth: np.ndarray
+    """(h, w) of the model; 0 where nothing is."""
+    part: np.ndarray
+    """(h, w) part id that covers each pixel; −1 where none does."""
+
+    @classmethod
+    def of(cls, camera: Camera, image: Tensor, drawn: Rendering) -> "Photograph":
+        """From a picture (rgb and more, h, w), and what the model draws there, channels being shares of movers."""
+        grey = image[:3].mean(0).cpu().numpy()
+        alpha, depth, shares = (x.cpu().numpy() for x in (drawn.alpha, drawn.depth, drawn.channels))
+        part = np.where((shares > 0.5).any(0), 1 + shares.argmax(0), np.where(alpha - shares.sum(0) > 0.5, 0, -1))
+        depth = np.where(alpha > 0.5, depth / np.maximum(alpha, 0.5), 0)
+        down, right = np.gradient(grey)
+        spline = ndimage.spline_filter(grey, order=3).astype(np.float32)
+        return cls(camera, spline, np.stack([right, down]), depth, part.astype(np.int16))
+
+    def intensities(self, at: np.ndarray) -> np.ndarray:
+        """Grey values at pixel positions (…, 2)."""
+        where = [at[..., 1] - 0.5, at[..., 0] - 0.5]
+        return ndimage.map_coordinates(self.spline, where, order=3, prefilter=False, mode="nearest")
+
+    def slopes(self, at: np.ndarray) -> np.ndarray:
+        """(…, 2) how grey values change along x and y at pixel positions (…, 2)."""
+        where = [at[..., 1] - 0.5, at[..., 0] - 0.5]
+        return np.stack([ndimage.map_coordinates(s, where, order=1, mode="nearest") for s in self.slope], -1)
+
+    def there(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Depth and part at pixel positions (n, m, 2); part −1 outside."""
+        (height, width), index = self.depth.shape, np.floor(at).astype(int)
+        inside = ((index >= 2) & (index < [width - 2, height - 2])).all(-1)
+        x, y = np.moveaxis(np.clip(index, 0, [width - 1, height - 1]), -1, 0)
+        return self.depth[y, x], np.where(inside, self.part[y, x], -1)
+
+
+@dataclass(frozen=True)
+class Patches:
+    """Planes on a part's surface, in the frame of state 0."""
+
+    part: int
+    points: np.ndarray
+    """(n, 3)."""
+    normals: np.ndarray
+    """(n, 3) outward."""
+    pixel: float
+    """Its size on the part, scene units."""
+    grid: np.ndarray
+    """(n, cells, 3) from each centre to its cells, in the plane."""
+    slant: np.ndarray
+    """(cells, 3) how a cell moves along the normal with its patch's offset and two tilts."""
+
+
+def patches_of(
+    part: int, photographs: Sequence[Photograph], config: PatchConfig, rng: np.random.Generator
+) -> Patches | None:
+    """Patches all over what photographs of state 0 show of a part; None where they show none of it.
+
+    Normals are those of the drawn depth.
+    """
+    reach = config.width // 2
+    points, normals, pixels = [np.zeros((0, 3))], [np.zeros((0, 3))], []
+    for photo in photographs:
+        y, x = np.nonzero(ndimage.binary_erosion(photo.part == part, iterations=reach + 1))
+        some = rng.permutation(len(x))[: 2 * config.per_part]
+        x, y = x[some], y[some]
+
+        def at(dx: int, dy: int, photo: Photograph = photo, x: np.ndarray = x, y: np.ndarray = y) -> np.ndarray:
+            return photo.camera.lifted(x + dx, y + dy, photo.depth[y + dy, x + dx])
+
+        across = np.cross(at(reach, 0) - at(-reach, 0), at(0, reach) - at(0, -reach))
+        normal = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+        towards = photo.camera.centre - at(0, 0)
+        normal *= np.sign((normal * towards).sum(1, keepdims=True))
+        faces = (normal * towards).sum(1) > LEAST_FACING * np.linalg.norm(towards, axis=1)
+        points.append(at(0, 0)[faces])
+        normals.append(normal[faces])
+        pixels.append(photo.depth[y, x][faces] / photo.camera.fx)
+    everything = np.concatenate(points)
+    if len(everything) == 0:
+        return None
+    pixel = float(np.median(np.concatenate(pixels)))
+    rows = thin(everything, reach * pixel, rng)[: config.per_part]
+    normal = np.concatenate(normals)[rows]
+    a, b = (cell.ravel() for cell in np.meshgrid(*[np.arange(-reach, reach + 1) * pixel] * 2))
+    u, v = np.moveaxis(np.stack([axes_across(n) for n in normal]), 1, 0)
+    grid = a[:, None] * u[:, None] + b[:, None] * v[:, None]
+    return Patches(part, everything[rows], normal, pixel, grid, np.stack([np.ones_like(a), a, b], 1))
+
+
+def shown(patches: Patches, T: np.ndarray, photograph: Photograph, tolerance: float) -> np.ndarray:
+    """(n,) bool: patches, moved by T, that face a photograph and lie on what the model draws there, up to corners."""
+    side = math.isqrt(patches.grid.shape[1])
+    cells = [0, side - 1, side * side // 2, -side, -1]
+    points, normals = moved(patches.points, T), patches.normals @ T[:3, :3].T
+    towards = photograph.camera.centre - points
+    facing = (normals * towards).sum(1) > LEAST_FACING * np.linalg.norm(towards, axis=1)
+    places = moved((patches.points[:, None] + patches.grid[:, cells]).reshape(-1, 3), T)
+    at, depth = photograph.camera.project(places)
+    drawn, part = photograph.there(at.reshape(-1, len(cells), 2))
+    on_it = (part == patches.part) & (np.abs(drawn - depth.reshape(drawn.shape)) < tolerance)
+    return facing & on_it.all(1)
+
+
+def adjust(
+    patches: Patches,
+    photographs: Sequence[Sequence[Photograph]],
+    place: Callable[[np.ndarray], np.ndarray],
+    expected: np.ndarray,
+    precision: np.ndarray,
+    extent: float,
+    config: PatchConfig,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The numbers of a part's joint that make its patches look alike in all photographs, by Gauss-Newton.
+
+    Args:
+        photographs: of every state.
+        place: numbers (p,) to T_state_0 (states, 4, 4) of the part.
+        expected: (p,) what is known of the numbers without patches, and where to start.
+        precision: (p, p) how well that is known: an inverse covariance.
+        extent: of the object.
+
+    Returns:
+        The numbers, and their covariance (p, p) by how far patches disagree.
+    """
+    theta, size = expected.copy(), len(expected)
+    local = np.zeros((len(patches.points), 3))
+    prior = 1 / np.array([DEEP * patches.pixel, TILTED, TILTED]) ** 2
+    shade = np.linalg.qr(patches.slant)[0].astype(np.float32)
+    covariance = np.linalg.inv(precision)
+    for _ in range(config.rounds):
+        at = place(theta)
+        shift = STEP * np.eye(size)
+        slopes = np.stack([(place(theta + d) - place(theta - d)) / (2 * STEP) for d in shift], 1)
+        # What is seen is asked again every time: chosen once, at a pose that is off, it would hold the part there.
+        patch, moves, texture, jacobian = _looks(patches, local, photographs, at, slopes, NEAR * extent)
+        if len(patch) == 0:
+            break
+        first = np.flatnonzero(np.diff(patch, prepend=-1))
+        which, group = patch[first], np.repeat(np.arange(len(first)), np.diff(first, append=len(patch)))
+        r, J, weight = _residuals(texture, jacobian, shade, first, group, moves)
+        q, H = J * weight[:, None, None], np.zeros((len(first), 3 + size, 3 + size))
+        H += np.add.reduceat(q.transpose(0, 2, 1) @ J, first)
+        g = np.add.reduceat((q.transpose(0, 2, 1) @ r[..., None])[..., 0], first).astype(float)
+        used = H[:, 0, 0] > 0
+        H[:, range(3), range(3)] += prior
+        g[:, :3] += prior * local[which]
+        back = np.linalg.solve(H[:, :3, :3], np.concatenate([g[:, :3, None], H[:, :3, 3:]], 2))
+        pull = g[:, 3:] - (H[:, 3:, :3] @ back[..., :1])[..., 0]
+        stiff = H[:, 3:, 3:] - H[:, 3:, :3] @ back[..., 1:]
+        change, covariance = _agreed(pull[used], stiff[used], theta - expected, precision)
+        step = -(back[..., 0] + back[..., 1:] @ change)
+        step[:, 0] = step[:, 0].clip(-3 * patches.pixel, 3 * patches.pixel)
+        local[which[used]] += step[used]
+        theta = theta + change
+    return theta, covariance
+
+
+def _looks(
+    patches: Patches,
+    local: np.ndarray,
+    photographs: Sequence[Sequence[Photograph]],
+    at: np.ndarray,
+    slopes: np.ndarray,
+    tolerance: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Pairs of a patch and a photograph that shows it, those of a patch together.
+
+    Returns:
+        The patch (pairs,) of each, whether it is of a state but the first (pairs,), and what ``_seen`` gives.
+    """
+    pairs = [
+        (state, photo, rows)
+        for state, T in enumerate(at)
+        for photo in photographs[state]
+        if len(rows := np.flatnonzero(shown(patches, T, photo, tolerance)))
+    ]
+    patch = np.concatenate([np.zeros(0, int), *(rows for _, _, rows in pairs)])
+    order = np.argsort(patch, kind="stable")
+    ends = np.cumsum([len(rows) for _, _, rows in pairs])
+    texture = np.zeros((len(order), len(patches.slant)), np.float32)
+    jacobian = np.zeros((*texture.shape, local.shape[1] + slopes.shape[1]), np.float32)
+    moves = np.zeros(len(order), bool)
+    for (state, photo, rows), slot in zip(pairs, np.split(np.argsort(order), ends[:-1]), strict=False):
+        texture[slot], jacobian[slot] = _seen(patches, rows, local[rows], photo, at[state], slopes[state])
+        moves[slot] = state > 0
+    return patch[order], moves, texture, jacobian
+
+
+def _seen(
+    patches: Patches, rows: np.ndarray, local: np.ndarray, photo: Photograph, T: np.ndarray, slopes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Grey values (n, cells) of patches in a photograph, and how they change with local and joint numbers.
+
+    ``local`` (n, 3) are offset and tilts; ``slopes`` (p, 4, 4) is how T changes with the numbers of the joint.
+    """
+    camera, R = photo.camera, photo.camera.T_camera_world[:3, :3]
+    normal = patches.normals[rows]
+    points = patches.points[rows, None] + patches.grid[rows] + (local @ patches.slant.T)[..., None] * normal[:, None]
+    flat = points.reshape(-1, 3)
+    place = moved(flat, T)
+    at, depth = camera.project(place)
+    inverse = 1 / depth[:, None]
+    along = photo.slopes(at) * [camera.fx, camera.fy] * inverse
+    x, y = ((place - camera.centre) @ R.T)[:, :2].T
+    deeper = -(along[:, :1] * x[:, None] + along[:, 1:] * y[:, None]) * inverse
+    gradient = np.concatenate([along, deeper], 1) @ R
+    by_normal = (gradient.reshape(points.shape) * (normal @ T[:3, :3].T)[:, None]).sum(-1)
+    by_joint = np.stack([(gradient * (flat @ D[:3, :3].T + D[:3, 3])).sum(1) for D in slopes], 1)
+    by_local = by_normal[..., None] * patches.slant
+    jacobian = np.concatenate([by_local, by_joint.reshape(*by_local.shape[:2], -1)], 2)
+    return photo.intensities(at).reshape(by_local.shape[:2]), jacobian
+
+
+def _residuals(
+    texture: np.ndarray,
+    jacobian: np.ndarray,
+    shade: np.ndarray,
+    first: np.ndarray,
+    group: np.ndarray,
+    moves: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Normalised grey values (pairs, cells) less the texture of their patch, their derivatives, and weights (pairs,).
+
+    Pairs are sorted by patch; ``first`` is where each begins, ``group`` the patch of each, ``moves`` whether it is one
+    of a state but the first. ``shade`` (cells, 3) spans what light does to a patch: level and slopes are no texture.
+    """
+    texture = texture - texture @ shade @ shade.T
+    contrast = texture.std(1) + 1e-4
+    texture /= contrast[:, None]
+    jacobian = (jacobian - shade @ (shade.T @ jacobian)) / contrast[:, None, None]
+
+    def mean(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """Of a patch's pairs, for each of them."""
+        total = np.add.reduceat(weight, first).reshape(-1, *[1] * (x.ndim - 1))
+        return (np.add.reduceat(x * weight.reshape(-1, *[1] * (x.ndim - 1)), first) / total)[group]
+
+    trust = np.ones(len(texture), np.float32)
+    for _ in range(3):
+        common = mean(texture, trust)
+        likeness = (texture * common).mean(1) / np.maximum(common.std(1), 1e-6)
+        trust = np.clip((likeness - DISAGREES) / (AGREES - DISAGREES), 1e-6, 1).astype(np.float32)
+    residual = texture - mean(texture, trust)
+    noise = mean((residual**2).mean(1), trust)
+    both = np.minimum(np.add.reduceat(trust * moves, first), np.add.reduceat(trust * ~moves, first)) >= FEWEST
+    good = both[group] & (mean(contrast, np.ones_like(contrast)) > CONTRAST)
+    return residual, jacobian - mean(jacobian, trust), trust * good / np.maximum(noise, NOISE)
+
+
+def _agreed(
+    pull: np.ndarray, stiff: np.ndarray, off: np.ndarray, precision: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The step (p,) on which patches agree with each other and with what was known, and the covariance after it.
+
+    Patches that pull far harder than most count less (a Cauchy-like weight on their Mahalanobis distance), and all
+    count less the more they disagree (a sandwich's mean inflation).
+
+    Args:
+        pull: (n, p) gradients of the patches.
+        stiff: (n, p, p) their curvatures.
+        off: (p,) from what was expected, which was known with ``precision`` (p, p).
+    """
+    weight, inverse = np.ones(len(pull)), np.linalg.pinv(stiff, rcond=1e-9, hermitian=True)
+    for _ in range(5):
+        H, g = np.tensordot(weight, stiff, 1), weight @ pull
+        step = -np.linalg.solve(H + precision, g + precision @ off)
+        left = pull + stiff @ step
+        distance = np.einsum("nk,nkl,nl->n", left, inverse, left)
+        weight = 1 / np.sqrt(1 + distance / (3 * np.median(distance) + 1e-12)) if len(pull) else weight
+    H, g = np.tensordot(weight, stiff, 1), weight @ pull
+    value, vector = np.linalg.eigh(H)
+    felt = value > 1e-9 * max(value.max(), 1e-300)
+    rank = int(felt.sum())
+    best = (vector[:, felt] / value[felt]) @ vector[:, felt].T
+    left = weight[:, None] * (pull - stiff @ (best @ g))
+    spread = np.trace(best @ (left.T @ left)) / max(rank, 1)
+    inflation = max(1.0, spread * len(pull) / max(len(pull) - rank, 1))
+    step = -np.linalg.solve(H / inflation + precision, g / inflation + precision @ off)
+    return step, np.linalg.inv(H / (inflation * ALIKE) + precision)
