@@ -147,6 +147,17 @@ def test_a_failed_run_is_a_row_and_is_run_again_only_when_asked(runner: Runner, 
     assert "no rigid parts" not in page.read_text()
 
 
+def test_a_broken_row_is_named_and_what_to_do_about_it(runner: Runner, options: BenchOptions) -> None:
+    bench(options, ("hingesplat",), None, told)
+    row = next((options.out / "runs").glob("*.json"))
+    row.write_text('{"object": ')
+    for again in (options, replace(options, retry=True)):
+        with pytest.raises(HingesplatError, match=r"line 1.*delete it") as told_user:
+            bench(again, ("hingesplat",), None, told)
+        assert str(row) in str(told_user.value)
+    assert runner.count("reconstruct") == 4
+
+
 def test_an_object_that_cannot_be_made_is_a_row(runner: Runner, options: BenchOptions) -> None:
     runner.fails = lambda args: "no space" if args[0] == "synth" else None
     bench(options, ("hingesplat",), None, told)

@@ -19,8 +19,17 @@ from typing import Any
 from PIL import Image
 
 from hingesplat.errors import HingesplatError
-from hingesplat.files import whole_file, write_json
-from hingesplat.results import PAPER_OBJECTS, Row, Table, load_rows, paper_table, variant_options, write_page
+from hingesplat.files import read_json, whole_file, write_json
+from hingesplat.results import (
+    BROKEN_ROW,
+    PAPER_OBJECTS,
+    Row,
+    Table,
+    load_rows,
+    paper_table,
+    variant_options,
+    write_page,
+)
 
 METHODS = ("hingesplat", "part2gs", "artgs", "vanilla")
 PRESETS = ("fast", "standard", "paper")
@@ -193,7 +202,7 @@ def run_all(cases: Sequence[Case], options: BenchOptions, homes: dict[str, Path]
 
 def is_there(case: Case, options: BenchOptions) -> bool:
     path = options.out / "runs" / f"{case.name}.json"
-    return path.is_file() and not (options.retry and "error" in json.loads(path.read_text()))
+    return path.is_file() and not (options.retry and "error" in read_json(path, BROKEN_ROW))
 
 
 def measure(case: Case, capture: Path | None, home: Path, out: Path) -> Row:
@@ -230,7 +239,7 @@ def measure(case: Case, capture: Path | None, home: Path, out: Path) -> Row:
 
 def results(run: Path) -> Row:
     """What a run says of itself, and what ``evaluate`` says of it."""
-    found = {name: json.loads((run / f"{name}.json").read_text()) for name in ("summary", "metrics")}
+    found = {name: read_json(run / f"{name}.json") for name in ("summary", "metrics")}
     found["metrics"].pop("truth", None)  # A folder of this machine says nothing elsewhere.
     return found
 

@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 
 from hingesplat.errors import HingesplatError
-from hingesplat.files import write_text
+from hingesplat.files import read_json, write_text
 
 Row = dict[str, Any]
 """A run: what ``bench.Case`` says of it, and its ``summary`` and ``metrics``, or its ``error``."""
+BROKEN_ROW = "delete it, and that run is made again"
+"""What to do about a row that cannot be read."""
 
 PAPER_OBJECTS = (
     *("foldchair", "fridge", "laptop", "oven", "scissor", "stapler", "usb", "washer", "blade", "storage"),
@@ -125,8 +127,12 @@ def variant_options(table: Table, changes: dict[str, str], method: str) -> dict[
 
 
 def load_rows(out: Path) -> list[Row]:
-    """Every recorded run, by name of its file."""
-    return [{"name": path.stem} | json.loads(path.read_text()) for path in sorted((out / "runs").glob("*.json"))]
+    """Every recorded run, by name of its file.
+
+    Raises:
+        HingesplatError: a row is broken.
+    """
+    return [{"name": path.stem} | read_json(path, BROKEN_ROW) for path in sorted((out / "runs").glob("*.json"))]
 
 
 def measured(rows: Sequence[Row]) -> list[Row]:
