@@ -32,7 +32,7 @@ DEEP, TILTED = 1.2, 0.3
 """How far patches lie off the drawn surface, in pixels, and how much they tilt, as a slope: standard deviations."""
 NEAR = 0.015
 """Extents from the drawn surface within which a patch is on it."""
-ALIKE = 9.0
+ALIKE = 20.0
 """Patches side by side err alike: so many count as one in standard deviations."""
 STEP = 1e-3
 """For derivatives of poses, radians and extents."""
