@@ -210,7 +210,8 @@ def shortest(
     """The set of the least length that adding, dropping and exchanging lead to, from the empty set.
 
     ``promising`` names what may be added to a set, the best first. Two motions that are right together replace one
-    that is nearly right for both, which comes first.
+    that is nearly right for both, which comes first; and two replace two where look-alikes are taken for each other, so
+    that either exchange alone is worse.
     """
 
     def trials(kept: frozenset[int]) -> Iterator[list[frozenset[int]]]:
@@ -218,9 +219,13 @@ def shortest(
         others = [k for k in promising(kept) if k not in kept]
         smaller = [kept - {k} for k in sorted(kept)]
         yield smaller + [kept | {k} for k in others[:ADDED]]
-        yield [less | {k} for less in smaller for k in others[:EXCHANGED]]
+        exchanged = [less | {k} for less in smaller for k in others[:EXCHANGED]]
+        yield exchanged
         instead = [[k for k in promising(less) if k not in kept][:PAIRED] for less in smaller]
         yield [less | set(pair) for less, ks in zip(smaller, instead, strict=True) for pair in combinations(ks, 2)]
+        near = sorted(exchanged, key=length)[:PAIRED]
+        second = [[k for k in promising(once) if k not in kept | once][:PAIRED] for once in near]
+        yield [once - {j} | {k} for once, ks in zip(near, second, strict=True) for j in once & kept for k in ks]
 
     kept: frozenset[int] = frozenset()
     while True:
