@@ -276,6 +276,18 @@ def test_a_better_one_takes_the_place_of_another() -> None:
     assert shortest(length, exact_first) == {1}
 
 
+def test_two_look_alikes_taken_for_each_other_are_exchanged_together() -> None:
+    """Two doors, each thought to go where the other went: with one of them right, both want the same surface."""
+    crossed, true = frozenset({1, 2}), frozenset({3, 4})
+
+    def length(kept: frozenset[int]) -> float:
+        if len(kept) < 2:
+            return 100 - 40 * len(kept) + 20 * len(kept & true)
+        return {crossed: 20, true: 10}.get(kept, 30 + 10 * (len(kept) - 2))
+
+    assert shortest(length, lambda kept: [1, 2, 3, 4]) == true
+
+
 # Labels.
 
 
