@@ -360,7 +360,7 @@ def _shared_errors(g: Gaussians, training: Sequence[Sequence[TrainingView]], pos
     pixel = float(np.median([_pixel(v.camera, g) for state in training for v in state])) / poses.extent
     axes, pivots = (x.detach().cpu().double().numpy() for x in (poses.axis(), poses.pivot()))
     variance = np.zeros(poses.theta.shape)
-    for j, turns in enumerate(poses.revolute.tolist()):
+    for j, turns in enumerate(poses.revolute.cpu().tolist()):
         points = g.means[g.part == j + 1].cpu().double().numpy()
         spread = math.sqrt(points.var(0).sum()) / poses.extent if len(points) else 1.0
         across = np.linalg.norm(np.cross(points - pivots[j], axes[j]), axis=1) / poses.extent
@@ -435,7 +435,7 @@ def _ambiguity(kind: JointType, points: np.ndarray, axis: np.ndarray, pivot: np.
 
 def _pixel(camera: Camera, gaussians: Gaussians) -> float:
     """The size of a pixel at the object's centre, scene units."""
-    return float(np.linalg.norm(camera.centre - gaussians.means.mean(0).double().numpy())) / camera.fx
+    return float(np.linalg.norm(camera.centre - gaussians.means.mean(0).double().cpu().numpy())) / camera.fx
 
 
 def _joints(
