@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hingesplat.camera import Camera
 from hingesplat.capture import View
 from hingesplat.chains import closest_joint, parents_of
 from hingesplat.gaussians import Gaussians
@@ -27,7 +26,7 @@ from hingesplat.poses import (
     state_loss,
 )
 from hingesplat.screw import axes_across
-from hingesplat.se3 import rotvec_to_matrix
+from hingesplat.se3 import from_Rt, rotvec_to_matrix
 from hingesplat.stereo import DepthMap
 from hingesplat.symmetry import round_about
 from hingesplat.training import Report, TrainingView, averaged, shuffled, thinned, training_views
@@ -144,9 +143,7 @@ class JointPoses:
         self.theta[joint] = torch.from_numpy(theta).to(self.theta)
         R, t = self.Rt()
         self.theta[joint] = own
-        T = np.tile(np.eye(4), (len(R), 1, 1))
-        T[:, :3, :3], T[:, :3, 3] = R[:, joint + 1].cpu().numpy(), t[:, joint + 1].cpu().numpy()
-        return T
+        return from_Rt(R[:, joint + 1], t[:, joint + 1]).cpu().double().numpy()
 
     def parents_first(self) -> list[int]:
         """Joints in an order in which none comes before the one that it hangs on."""
@@ -234,11 +231,11 @@ def find_joints(
 
     together = round((1 - config.settled if config.patches.per_part else 1) * config.steps)
     finished, all_sh = refine(range(together), joints_too=True)
-    covariance = _shared_errors(finished, training, poses)
+    shared = covariance = _shared_errors(finished, training, poses)
     if config.uncertainty_views:
-        covariance += _covariances(finished, all_sh, training, poses, config)
+        covariance = shared + _covariances(finished, all_sh, training, poses, config)
     if config.patches.per_part:
-        covariance = _by_patches(finished, training, poses, covariance, config.patches, rng)
+        covariance = _by_patches(finished, training, poses, covariance, LEFT**2 * shared, config.patches, rng)
     finished, all_sh = refine(range(together, config.steps), joints_too=False)
     seen = _views_that_show(finished, training, poses)
     finished, all_sh = finished.to("cpu"), all_sh.cpu()
@@ -330,18 +327,21 @@ def _by_patches(
     training: Sequence[Sequence[TrainingView]],
     poses: JointPoses,
     covariance: np.ndarray,
+    left: np.ndarray,
     config: PatchConfig,
     rng: np.random.Generator,
 ) -> np.ndarray:
     """Settle ``poses`` by the texture of the parts, as far as that tells more than is known; what is known then.
 
-    ``covariance`` (joints, p, p), of what is known and of what comes out, is that of the rows of ``theta``.
+    ``covariance`` (joints, p, p), of what is known and of what comes out, is that of the rows of ``theta``; ``left``
+    (joints, p, p) is what patches do not take away.
     """
-    photographs = []
-    for state, views in enumerate(thinned(training, config.views)):
-        R, t = (x[state : state + 1].detach() for x in poses.Rt())
-        photographs.append([Photograph.of(view.camera, view.image, r) for view, r in drawn_parts(g, R, t, [views])])
-    settled, left = covariance.copy(), LEFT**2 * _shared_errors(g, training, poses)
+    R, t = (x.detach() for x in poses.Rt())
+    photographs = [
+        [Photograph.of(view.camera, view.image, r) for view, r in drawn_parts(g, R[s : s + 1], t[s : s + 1], [views])]
+        for s, views in enumerate(thinned(training, config.views))
+    ]
+    settled = covariance.copy()
     for j in poses.parents_first():
         patches = patches_of(j + 1, photographs[0], config, rng)
         if patches is not None:
@@ -357,7 +357,9 @@ def _by_patches(
 
 def _shared_errors(g: Gaussians, training: Sequence[Sequence[TrainingView]], poses: JointPoses) -> np.ndarray:
     """(joints, 4 + states − 1, 4 + states − 1) covariance of ``theta`` by what all photographs get wrong alike."""
-    pixel = float(np.median([_pixel(v.camera, g) for state in training for v in state])) / poses.extent
+    centre = g.means.mean(0).double().cpu().numpy()
+    cameras = [view.camera for state in training for view in state]
+    pixel = float(np.median([np.linalg.norm(c.centre - centre) / c.fx for c in cameras])) / poses.extent
     axes, pivots = (x.detach().cpu().double().numpy() for x in (poses.axis(), poses.pivot()))
     variance = np.zeros(poses.theta.shape)
     for j, turns in enumerate(poses.revolute.cpu().tolist()):
@@ -431,11 +433,6 @@ def _ambiguity(kind: JointType, points: np.ndarray, axis: np.ndarray, pivot: np.
     if kind == "revolute":
         return "; ambiguous: round about its axis, so that only its texture tells how far it turned"
     return "; ambiguous: round about its axis, so that only its texture would tell if it turned as well"
-
-
-def _pixel(camera: Camera, gaussians: Gaussians) -> float:
-    """The size of a pixel at the object's centre, scene units."""
-    return float(np.linalg.norm(camera.centre - gaussians.means.mean(0).double().cpu().numpy())) / camera.fx
 
 
 def _joints(

@@ -200,9 +200,9 @@ def adjust(
         first = np.flatnonzero(np.diff(patch, prepend=-1))
         which, group = patch[first], np.repeat(np.arange(len(first)), np.diff(first, append=len(patch)))
         r, J, weight = _residuals(texture, jacobian, shade, first, group, moves)
-        q, H = J * weight[:, None, None], np.zeros((len(first), 3 + size, 3 + size))
-        H += np.add.reduceat(q.transpose(0, 2, 1) @ J, first)
-        g = np.add.reduceat((q.transpose(0, 2, 1) @ r[..., None])[..., 0], first).astype(float)
+        weighted = (J * weight[:, None, None]).transpose(0, 2, 1)
+        H = np.add.reduceat(weighted @ J, first).astype(float)
+        g = np.add.reduceat((weighted @ r[..., None])[..., 0], first).astype(float)
         used = H[:, 0, 0] > 0
         H[:, range(3), range(3)] += prior
         g[:, :3] += prior * local[which]
