@@ -1,62 +1,17 @@
-"""Joints by the texture of patches: a card with a smooth texture, drawn by rays, whose joint is known exactly."""
+"""Joints by the texture of patches, on a card whose joint is known exactly."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
-import torch
 
-from hingesplat.patches import PatchConfig, Patches, Photograph, _agreed, _seen, adjust, patches_of, shown
-from hingesplat.render import Rendering
-from hingesplat.screw import joint_motion
-from scenes import ANGLE, AXIS, FORWARD, PIVOT, SLIDE, cameras_around, look_at
+from card import CARD, photographs, place
+from hingesplat.patches import PatchConfig, Patches, _agreed, _seen, adjust, patches_of, shown
+from scenes import FORWARD
 
 CONFIG = PatchConfig(per_part=60)
 KNOWN = np.diag([1 / 0.03, 1 / 0.03, 1 / 0.03]) ** 2
 """How well the three numbers of a joint are known that ``place`` has: hardly."""
-CARD = np.array([0.0, -0.46, 0.0])
-HALF = 0.4
-"""The card is a square in the plane y = −0.46, facing −y."""
-
-
-def photograph(eye: np.ndarray, T: np.ndarray) -> Photograph:
-    """The card, moved by T, before nothing."""
-    camera = look_at(eye, 140)
-    y, x = np.mgrid[: camera.height, : camera.width]
-    away = (camera.lifted(x.ravel(), y.ravel(), np.ones(x.size)) - camera.centre).reshape(*x.shape, 3)
-    R, t = T[:3, :3], T[:3, 3]
-    depth = ((CARD @ R.T + t - camera.centre) @ (R @ FORWARD)) / (away @ (R @ FORWARD))
-    at = (camera.centre + depth[..., None] * away - t) @ R - CARD
-    on = (np.abs(at[..., [0, 2]]) < HALF).all(-1) & (depth > 0)
-    u, v = 40 * at[..., 0], 40 * at[..., 2]
-    texture = 0.5 + 0.1 * (np.sin(u) + np.sin(0.7 * v + 1) + np.sin(0.6 * (u + v)) * np.cos(0.8 * (u - v) + 2))
-    grey, alpha, depth = (torch.from_numpy(np.where(on, value, 0)).float() for value in (texture, 1.0, depth))
-    image = torch.stack([grey, grey, grey, alpha])
-    return Photograph.of(camera, image, Rendering(image, depth, alpha[None]))
-
-
-@cache
-def photographs(kind: str) -> list[list[Photograph]]:
-    """The card in both states, by cameras in front."""
-    eyes = [c.centre for c in cameras_around(60, 8) if c.centre[1] < -1.0]
-    return [[photograph(eye, T) for eye in eyes] for T in place(kind)(np.zeros(3))]
-
-
-def place(kind: str) -> Callable[[np.ndarray], np.ndarray]:
-    """A tilt of the axis, a shift of the pivot and a change of the value: zero is the truth."""
-    tilt, aside = np.array([1.0, 0, 0]), np.array([1.0, 0, 0])
-    axis, value = (AXIS, ANGLE) if kind == "revolute" else (FORWARD, SLIDE)
-
-    def poses(theta: np.ndarray) -> np.ndarray:
-        turned = axis + theta[0] * tilt
-        turned = turned / np.linalg.norm(turned)
-        return np.stack([np.eye(4), joint_motion(kind, turned, PIVOT + theta[1] * aside, value + theta[2])])
-
-    return poses
-
-
 OFF = {"revolute": np.array([0.006, 0.004, 0.008]), "prismatic": np.array([0.008, 0.0, 0.004])}
 
 
@@ -92,12 +47,12 @@ def test_a_patch_shows_where_it_faces_the_camera_and_the_model_draws_it() -> Non
 @pytest.mark.parametrize("kind", ["revolute", "prismatic"])
 def test_patches_find_the_joint_again(kind: str) -> None:
     start = OFF[kind]
-    theta, covariance = adjust(patches(kind), photographs(kind), place(kind), start, KNOWN, 1.0, CONFIG)
+    theta, covariance = adjust(patches(kind), photographs(kind), place(kind), start, KNOWN, 1.0, CONFIG.rounds)
     felt = start != 0
     np.testing.assert_allclose(theta[felt], 0, atol=2e-4)
     assert (np.sqrt(np.diag(covariance))[felt] < 1e-3).all()
     np.testing.assert_allclose(covariance, covariance.T, rtol=1e-5)
-    again = adjust(patches(kind), photographs(kind), place(kind), start, KNOWN, 1.0, CONFIG)
+    again = adjust(patches(kind), photographs(kind), place(kind), start, KNOWN, 1.0, CONFIG.rounds)
     np.testing.assert_array_equal(theta, again[0])
 
 
@@ -113,8 +68,9 @@ def test_light_does_not_matter() -> None:
         )
         for i, p in enumerate(second)
     ]
-    theta, _ = adjust(patches("revolute"), [first, darker], place("revolute"), OFF["revolute"], KNOWN, 1.0, CONFIG)
-    same, _ = adjust(patches("revolute"), [first, second], place("revolute"), OFF["revolute"], KNOWN, 1.0, CONFIG)
+    start, found = OFF["revolute"], patches("revolute")
+    theta, _ = adjust(found, [first, darker], place("revolute"), start, KNOWN, 1.0, CONFIG.rounds)
+    same, _ = adjust(found, [first, second], place("revolute"), start, KNOWN, 1.0, CONFIG.rounds)
     np.testing.assert_allclose(theta, same, atol=2e-4)
 
 
@@ -123,7 +79,7 @@ def test_without_texture_or_photographs_what_was_known_remains() -> None:
     start, found = OFF["revolute"], patches("revolute")
     grey = [[replace(p, spline=0 * p.spline + 0.5, slope=0 * p.slope) for p in s] for s in (first, second)]
     for states in (grey, [[], []], [first, []]):
-        theta, covariance = adjust(found, states, place("revolute"), start, KNOWN, 1.0, CONFIG)
+        theta, covariance = adjust(found, states, place("revolute"), start, KNOWN, 1.0, CONFIG.rounds)
         np.testing.assert_allclose(theta, start, atol=1e-12)
         np.testing.assert_allclose(covariance, np.linalg.inv(KNOWN))
 

@@ -1,6 +1,6 @@
 """Which Gaussians move, with which motion: the pieces, and the whole on a made object."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
@@ -11,7 +11,7 @@ import pytest
 
 from hingesplat.gaussians import concatenate, posed
 from hingesplat.hypotheses import PATCH, HypothesesConfig, axis_directions, distinct, groups_to_try, registered
-from hingesplat.labelling import Labelling, label_costs, neighbour_weights, seed_costs, shortest, softmax
+from hingesplat.labelling import Choices, Labelling, label_costs, neighbour_weights, seed_costs, shortest, softmax
 from hingesplat.pieces import reattach_fragments, split_pieces
 from hingesplat.render import render
 from hingesplat.screw import prismatic, revolute
@@ -28,7 +28,8 @@ from hingesplat.segment import (
     track,
 )
 from hingesplat.stereo import Cloud, DepthMap, StereoConfig, depth_map, stereo
-from hingesplat.surface import Surface, bounds, components, surface_of, thin
+from hingesplat.surface import Labels, Surface, bounds, components, surface_of, thin
+from hingesplat.texture import told_apart
 from hingesplat.visibility import FREE, HIDDEN, SURFACE, Sight, ask
 from scenes import (
     ANGLE,
@@ -424,20 +425,47 @@ def test_labels_follow_the_motions_and_a_false_one_is_dropped(
     made, surfaces, extent = turned
     problem = Labelling.of(surfaces, extent)
     false = Motion("revolute", np.eye(3)[0], np.zeros(3), 1.5, 1.0)
-    kept, labels = problem.choose([false.T, TURN.T], 20.0, None)
-    assert kept == [1]
+    choices, prices = Choices(problem, [false.T, TURN.T]), np.full(2, 20.0)
+    assert choices.best(prices, None) == {1}
+    labels = choices.labels([1])
     for s in (0, 1):
         part = parts_of(made, surfaces[s], s)
         assert (labels[s] == part).mean() > 0.92
         assert (problem.labels([TURN.T])[s] == labels[s]).all()
-    assert problem.choose([false.T, TURN.T], 20.0, 2)[0] == [1]  # A number that is given is an upper bound.
-    assert problem.choose([false.T, TURN.T], 20.0, 0)[0] == []
+    assert choices.best(prices, 2) == {1}  # A number that is given is an upper bound.
+    assert choices.best(prices, 0) == set()
+    assert choices.best(np.array([1e5, 1e5]), None) == set()
 
 
 def test_no_price_is_paid_for_a_motion_that_only_hides(turned: Turned) -> None:
     _, surfaces, extent = turned
     into_the_box = prismatic(FORWARD, -0.5 * extent)
-    assert Labelling.of(surfaces, extent).choose([into_the_box, TURN.T], PRICE, None)[0] == [1]
+    choices = Choices(Labelling.of(surfaces, extent), [into_the_box, TURN.T])
+    assert choices.best(np.full(2, float(PRICE)), None) == {1}
+
+
+def test_texture_is_asked_about_what_is_chosen_and_may_have_it_replaced(turned: Turned) -> None:
+    """Of two motions that explain the same, one is chosen; that texture speaks against it brings in the other."""
+    _, surfaces, extent = turned
+    choices = Choices(Labelling.of(surfaces, extent), [TURN.T, TURN.T])
+    (usual,) = choices.best(np.full(2, 20.0), None)
+    asked = []
+
+    def against(says: dict[int, float]) -> Callable[[int, Labels], float]:
+        def say(k: int, owned: Labels) -> float:
+            asked.append(k)
+            assert min(owned[0].sum(), owned[1].sum()) > 50
+            return says[k]
+
+        return say
+
+    assert told_apart(choices, against({usual: -3}), 20, None) == {usual: 20}
+    assert told_apart(choices, against({usual: 30, 1 - usual: -100}), 20, None) == {1 - usual: 10}
+    assert told_apart(choices, against({usual: 30, 1 - usual: 35}), 20, None) == {usual: 50}
+    assert told_apart(choices, against({usual: 9}), 20, None) == {usual: 20}
+    assert asked == [usual, usual, 1 - usual, usual, 1 - usual, usual]
+    # However loud texture is, what nothing else explains stays: a door that shows its other side.
+    assert told_apart(Choices(Labelling.of(surfaces, extent), [TURN.T]), against({0: 1e6}), 20, None) == {0: 60}
 
 
 def test_registered_keeps_the_kind_and_the_sign(turned: Turned) -> None:
@@ -511,7 +539,7 @@ def test_two_motions_that_nearly_agree_are_tried_as_one_on_what_both_own(monkeyp
     far = Motion("prismatic", np.eye(3)[0], np.zeros(3), 0.5, 1.0)
     evidence = cast(Any, SimpleNamespace(surfaces=(plain(PART), plain(PART)), extent=1.0))
     owners = [(np.arange(10), np.arange(5)), (np.arange(10, 30), np.arange(5, 9)), (np.arange(30, 40), np.arange(0))]
-    assert one_for_two(evidence, [half, other, far], owners) == [other]
+    assert one_for_two(evidence, [half, other, far], owners) == {(1, 0): other}
     ((motion, own),) = asked
     assert motion is other and [rows.tolist() for rows in own] == [list(range(30)), list(range(9))]
 
@@ -591,11 +619,14 @@ def test_of_what_a_fragment_touches_photographs_choose(monkeypatch) -> None:
         assert set(found[625:725]) == {2}
 
 
-@pytest.mark.parametrize(("cost", "label"), [(0.9, 1), (0.3, 0)])
-def test_a_fragment_that_the_photographs_are_sure_of_stays_what_it_is(monkeypatch, cost: float, label: int) -> None:
-    """A knife's blade touches only the handle; ``cost`` is what the photographs say of it if it had stayed there."""
+@pytest.mark.parametrize(("cost", "own", "label"), [(0.9, 0.1, 1), (0.3, 0.1, 0), (0.9, 0.3, 0)])
+def test_a_fragment_that_the_photographs_are_sure_of_stays_what_it_is(
+    monkeypatch, cost: float, own: float, label: int
+) -> None:
+    """A knife's blade touches only the handle; ``cost`` is what the photographs say of it if it had stayed there, and
+    ``own`` what they say if it moves: at 0.3, no more than that nobody sees it."""
     monkeypatch.setattr(
-        "hingesplat.pieces.label_costs", lambda surface, *_, **__: np.tile([cost, 0.1], (len(surface.points), 1))
+        "hingesplat.pieces.label_costs", lambda surface, *_, **__: np.tile([cost, own], (len(surface.points), 1))
     )
     surfaces = both_states((PART, SHIFT), (patch((0, 0, -0.95), 14), SHIFT))
     given = np.repeat([0, 1, 1], [400, 225, 196])

@@ -346,8 +346,9 @@ def _by_patches(
         patches = patches_of(j + 1, photographs[0], config, rng)
         if patches is not None:
             start = poses.theta[j].detach().cpu().double().numpy()
+            known = np.linalg.inv(covariance[j])
             theta, settled[j] = adjust(
-                patches, photographs, partial(poses.place, j), start, np.linalg.inv(covariance[j]), poses.extent, config
+                patches, photographs, partial(poses.place, j), start, known, poses.extent, config.rounds
             )
             settled[j] += left[j]
             with torch.no_grad():

@@ -155,53 +155,65 @@ class Labelling:
         """Labels of both states' points under these motions, all of which stay."""
         return self.mean_field(self.costs(T_1_0), self.partners(T_1_0))[0]
 
-    def choose(self, T_1_0: Sequence[np.ndarray], part_cost: float, parts: int | None) -> tuple[list[int], Labels]:
-        """The motions that explain both states at the least description length: energy and a price for each.
 
-        That two points meet counts, so a motion gains little that would explain a surface of one state by a surface
-        of the other that has a better explanation.
+class Choices:
+    """Motions to choose from; what a set of them explains is worked out once. Sets hold indices of motions.
+
+    That two points meet counts, so a motion gains little that would explain a surface of one state by a surface of the
+    other that has a better explanation.
+    """
+
+    def __init__(self, problem: Labelling, T_1_0: Sequence[np.ndarray]) -> None:
+        self.problem, self.number = problem, len(T_1_0)
+        self._costs, self._partners = problem.costs(T_1_0), problem.partners(T_1_0)
+        # Fewer iterations would leave energies off by as much as one look-alike differs from another.
+        self._solved = cache(self._solve)
+
+    def _solve(self, kept: frozenset[int]) -> tuple[Labels, float]:
+        """Labels that are columns of the costs, and their energy."""
+        columns = [0, *(k + 1 for k in sorted(kept))]
+        (first, second), energy = self.problem.mean_field(
+            [c[:, columns] for c in self._costs], [p[:, columns] for p in self._partners]
+        )
+        return (np.array(columns)[first], np.array(columns)[second]), energy
+
+    def best(self, prices: np.ndarray, parts: int | None) -> frozenset[int]:
+        """The set that explains both states at the least description length: energy and a price for each motion.
 
         Args:
-            T_1_0: motions to choose from.
-            part_cost: the price of each.
+            prices: (motions,) in points.
             parts: choose no more than this many.
-
-        Returns:
-            The indices of the motions chosen, and labels that count them from 1.
         """
-        costs, partners = self.costs(T_1_0), self.partners(T_1_0)
+        points = sum(map(len, self._costs))
 
-        # Fewer iterations would leave energies off by as much as one look-alike differs from another.
-        @cache
-        def solved(kept: frozenset[int]) -> tuple[Labels, float]:
-            columns = [0, *sorted(kept)]
-            (first, second), energy = self.mean_field([c[:, columns] for c in costs], [p[:, columns] for p in partners])
+        def length(kept: frozenset[int]) -> float:
             too_many = 0 if parts is None else max(len(kept) - parts, 0)
-            price = part_cost * len(kept) + sum(map(len, costs)) * too_many
-            return (np.array(columns)[first], np.array(columns)[second]), energy + price
+            return self._solved(kept)[1] + float(prices[sorted(kept)].sum()) + points * too_many
 
-        kept = shortest(
-            lambda kept: solved(kept)[1],
-            lambda kept: self.promising(costs, partners, solved(kept)[0]),
-        )
-        rank = np.zeros(costs[0].shape[1], int)
-        rank[sorted(kept)] = np.arange(1, len(kept) + 1)
-        first, second = solved(kept)[0]
-        return [k - 1 for k in sorted(kept)], (rank[first], rank[second])
+        return shortest(length, lambda kept: self.promising(kept, prices))
 
-    def promising(self, costs: list[np.ndarray], partners: list[np.ndarray], labels: Labels) -> list[int]:
-        """Labels (columns) but the first, those first that the points would gain most by if their partners agreed."""
-        gain = np.zeros(costs[0].shape[1])
-        for s in (0, 1):
+    def labels(self, kept: Sequence[int]) -> Labels:
+        """Labels of both states' points: 0 stays, i + 1 is to move by ``kept[i]``."""
+        rank = np.zeros(1 + self.number, int)
+        rank[[k + 1 for k in kept]] = np.arange(1, len(kept) + 1)
+        first, second = self._solved(frozenset(kept))[0]
+        return rank[first], rank[second]
+
+    def promising(self, kept: frozenset[int], prices: np.ndarray) -> list[int]:
+        """All motions, those first that the points would gain most by if their partners agreed, less their prices."""
+        labels, consistency = self._solved(kept)[0], self.problem.consistency
+        gain = np.zeros(self.number)
+        for s, weights in enumerate(self.problem.weights):
+            costs, partners = self._costs[s], self._partners[s]
             row, label = np.arange(len(labels[s])), labels[s]
-            met = partners[s] >= 0
-            agree = np.where(met[row, label], labels[1 - s][partners[s][row, label]] == label, NOBODY)
-            now = costs[s][row, label] - 0.5 * self.consistency * agree
-            then = costs[s] - 0.5 * self.consistency * np.where(met, 1.0, NOBODY)
-            better = now[:, None] - then
-            average = (self.weights[s] @ better + better) / (1 + self.weights[s].sum(1))
+            met = partners >= 0
+            agree = np.where(met[row, label], labels[1 - s][partners[row, label]] == label, NOBODY)
+            now = costs[row, label] - 0.5 * consistency * agree
+            then = costs - 0.5 * consistency * np.where(met, 1.0, NOBODY)
+            better = (now[:, None] - then)[:, 1:]
+            average = (weights @ better + better) / (1 + weights.sum(1))
             gain += np.maximum(np.asarray(average), 0).sum(0)
-        return [int(k) for k in np.argsort(-gain) if k > 0]
+        return [int(k) for k in np.argsort(prices - gain)]
 
 
 def shortest(

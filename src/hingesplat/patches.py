@@ -71,7 +71,8 @@ class Photograph:
         """From a picture (rgb and more, h, w), and what the model draws there, channels being shares of movers."""
         grey = image[:3].mean(0).cpu().numpy()
         alpha, depth, shares = (x.cpu().numpy() for x in (drawn.alpha, drawn.depth, drawn.channels))
-        part = np.where((shares > 0.5).any(0), 1 + shares.argmax(0), np.where(alpha - shares.sum(0) > 0.5, 0, -1))
+        shares = np.concatenate([(alpha - shares.sum(0))[None], shares])
+        part = np.where((shares > 0.5).any(0), shares.argmax(0), -1)
         depth = np.where(alpha > 0.5, depth / np.maximum(alpha, 0.5), 0)
         down, right = np.gradient(grey)
         spline = ndimage.spline_filter(grey, order=3).astype(np.float32)
@@ -111,6 +112,15 @@ class Patches:
     slant: np.ndarray
     """(cells, 3) how a cell moves along the normal with its patch's offset and two tilts."""
 
+    @classmethod
+    def at(cls, part: int, points: np.ndarray, normals: np.ndarray, pixel: float, width: int) -> "Patches":
+        """Squares of ``width`` cells of ``pixel`` scene units about points (n, 3) with outward normals (n, 3)."""
+        reach = width // 2
+        a, b = (cell.ravel() for cell in np.meshgrid(*[np.arange(-reach, reach + 1) * pixel] * 2))
+        u, v = np.moveaxis(np.stack([axes_across(n) for n in normals]), 1, 0)
+        grid = a[:, None] * u[:, None] + b[:, None] * v[:, None]
+        return cls(part, points, normals, pixel, grid, np.stack([np.ones_like(a), a, b], 1))
+
 
 def patches_of(
     part: int, photographs: Sequence[Photograph], config: PatchConfig, rng: np.random.Generator
@@ -142,11 +152,7 @@ def patches_of(
         return None
     pixel = float(np.median(np.concatenate(pixels)))
     rows = thin(everything, reach * pixel, rng)[: config.per_part]
-    normal = np.concatenate(normals)[rows]
-    a, b = (cell.ravel() for cell in np.meshgrid(*[np.arange(-reach, reach + 1) * pixel] * 2))
-    u, v = np.moveaxis(np.stack([axes_across(n) for n in normal]), 1, 0)
-    grid = a[:, None] * u[:, None] + b[:, None] * v[:, None]
-    return Patches(part, everything[rows], normal, pixel, grid, np.stack([np.ones_like(a), a, b], 1))
+    return Patches.at(part, everything[rows], np.concatenate(normals)[rows], pixel, config.width)
 
 
 def shown(patches: Patches, T: np.ndarray, photograph: Photograph, tolerance: float) -> np.ndarray:
@@ -170,7 +176,7 @@ def adjust(
     expected: np.ndarray,
     precision: np.ndarray,
     extent: float,
-    config: PatchConfig,
+    rounds: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The numbers of a part's joint that make its patches look alike in all photographs, by Gauss-Newton.
 
@@ -180,6 +186,7 @@ def adjust(
         expected: (p,) what is known of the numbers without patches, and where to start.
         precision: (p, p) how well that is known: an inverse covariance.
         extent: of the object.
+        rounds: of Gauss-Newton.
 
     Returns:
         The numbers, and their covariance (p, p) by how far patches disagree.
@@ -189,12 +196,12 @@ def adjust(
     prior = 1 / np.array([DEEP * patches.pixel, TILTED, TILTED]) ** 2
     shade = np.linalg.qr(patches.slant)[0].astype(np.float32)
     covariance = np.linalg.inv(precision)
-    for _ in range(config.rounds):
+    for _ in range(rounds):
         at = place(theta)
         shift = STEP * np.eye(size)
         slopes = np.stack([(place(theta + d) - place(theta - d)) / (2 * STEP) for d in shift], 1)
         # What is seen is asked again every time: chosen once, at a pose that is off, it would hold the part there.
-        patch, moves, texture, jacobian = _looks(patches, local, photographs, at, slopes, NEAR * extent)
+        patch, moves, texture, jacobian = looks(patches, local, photographs, at, slopes, NEAR * extent)
         if len(patch) == 0:
             break
         first = np.flatnonzero(np.diff(patch, prepend=-1))
@@ -217,7 +224,7 @@ def adjust(
     return theta, covariance
 
 
-def _looks(
+def looks(
     patches: Patches,
     local: np.ndarray,
     photographs: Sequence[Sequence[Photograph]],
@@ -267,7 +274,7 @@ def _seen(
     deeper = -(along[:, :1] * x[:, None] + along[:, 1:] * y[:, None]) * inverse
     gradient = np.concatenate([along, deeper], 1) @ R
     by_normal = (gradient.reshape(points.shape) * (normal @ T[:3, :3].T)[:, None]).sum(-1)
-    by_joint = np.stack([(gradient * (flat @ D[:3, :3].T + D[:3, 3])).sum(1) for D in slopes], 1)
+    by_joint = np.array([(gradient * (flat @ D[:3, :3].T + D[:3, 3])).sum(1) for D in slopes]).T
     by_local = by_normal[..., None] * patches.slant
     jacobian = np.concatenate([by_local, by_joint.reshape(*by_local.shape[:2], -1)], 2)
     return photo.intensities(at).reshape(by_local.shape[:2]), jacobian
@@ -286,26 +293,40 @@ def _residuals(
     Pairs are sorted by patch; ``first`` is where each begins, ``group`` the patch of each, ``moves`` whether it is one
     of a state but the first. ``shade`` (cells, 3) spans what light does to a patch: level and slopes are no texture.
     """
+    texture, contrast = without_light(texture, shade)
+    jacobian = (jacobian - shade @ (shade.T @ jacobian)) / contrast[:, None, None]
+    common, trust = in_common(texture, first, group)
+    residual = texture - common[group]
+    noise = mean_of((residual**2).mean(1), trust, first)[group]
+    both = np.minimum(np.add.reduceat(trust * moves, first), np.add.reduceat(trust * ~moves, first)) >= FEWEST
+    good = (both & (mean_of(contrast, np.ones_like(contrast), first) > CONTRAST))[group]
+    return residual, jacobian - mean_of(jacobian, trust, first)[group], trust * good / np.maximum(noise, NOISE)
+
+
+def without_light(texture: np.ndarray, shade: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Grey values (n, cells) less what ``shade`` (cells, 3) spans, of unit variance; their contrast (n,) before."""
     texture = texture - texture @ shade @ shade.T
     contrast = texture.std(1) + 1e-4
-    texture /= contrast[:, None]
-    jacobian = (jacobian - shade @ (shade.T @ jacobian)) / contrast[:, None, None]
+    return texture / contrast[:, None], contrast
 
-    def mean(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        """Of a patch's pairs, for each of them."""
-        total = np.add.reduceat(weight, first).reshape(-1, *[1] * (x.ndim - 1))
-        return (np.add.reduceat(x * weight.reshape(-1, *[1] * (x.ndim - 1)), first) / total)[group]
 
+def in_common(texture: np.ndarray, first: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What normalised textures (n, cells) of a group have in common (groups, cells); how far each is that, (n,).
+
+    Groups lie together: ``first`` is where each begins, ``group`` that of each texture.
+    """
     trust = np.ones(len(texture), np.float32)
     for _ in range(3):
-        common = mean(texture, trust)
-        likeness = (texture * common).mean(1) / np.maximum(common.std(1), 1e-6)
+        common = mean_of(texture, trust, first)
+        likeness = (texture * common[group]).mean(1) / np.maximum(common.std(1), 1e-6)[group]
         trust = np.clip((likeness - DISAGREES) / (AGREES - DISAGREES), 1e-6, 1).astype(np.float32)
-    residual = texture - mean(texture, trust)
-    noise = mean((residual**2).mean(1), trust)
-    both = np.minimum(np.add.reduceat(trust * moves, first), np.add.reduceat(trust * ~moves, first)) >= FEWEST
-    good = both[group] & (mean(contrast, np.ones_like(contrast)) > CONTRAST)
-    return residual, jacobian - mean(jacobian, trust), trust * good / np.maximum(noise, NOISE)
+    return mean_of(texture, trust, first), trust
+
+
+def mean_of(x: np.ndarray, weight: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Weighted means (groups, …) of x (n, …), whose groups lie together and begin at ``first``."""
+    weight = weight.reshape(-1, *[1] * (x.ndim - 1))
+    return np.add.reduceat(x * weight, first) / np.add.reduceat(weight, first)
 
 
 def _agreed(

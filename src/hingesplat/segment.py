@@ -27,12 +27,13 @@ from hingesplat.hypotheses import (
     propose_hanging,
     refit,
 )
-from hingesplat.labelling import Labelling, seed_costs
+from hingesplat.labelling import Choices, Labelling, seed_costs
 from hingesplat.pieces import reattach_fragments, split_pieces
 from hingesplat.se3 import moved
 from hingesplat.search import BASE, Motion, ScoreVolume, carrier_of, inverted, novelty, scan, score_volume
 from hingesplat.stereo import DepthMap
-from hingesplat.surface import Surface, bounds, surface_of, thin
+from hingesplat.surface import Labels, Surface, bounds, surface_of, thin
+from hingesplat.texture import TextureConfig, against, photographs_of, told_apart
 from hingesplat.visibility import FREE, HIDDEN, ask
 
 ALIKE = 0.06
@@ -68,6 +69,7 @@ class SegmentConfig:
     hypotheses: HypothesesConfig = field(default_factory=HypothesesConfig)
     rounds: int = 3
     """Rounds of relabelling and refining the motions."""
+    texture: TextureConfig = field(default_factory=TextureConfig)
 
 
 @dataclass(frozen=True)
@@ -195,24 +197,36 @@ def segment(
     rows = [thin(surface.points, 2 * config.spacing * extent, rng) for surface in surfaces]
     problem = Labelling.of((surfaces[0].rows(rows[0]), surfaces[1].rows(rows[1])), extent)
 
-    def settled(candidates: list[Motion], price: float) -> list[Motion]:
+    def settled(candidates: list[Motion], prices: list[float]) -> list[Motion]:
         """Those of the candidates that there are, refined on what they own."""
-        shared: list[Motion] = []
+        owners: list[Labels] = []
         for _ in range(config.rounds):
-            candidates = [*candidates, *shared]
-            kept, owned = problem.choose([m.T for m in candidates], price, parts)
+            shared = one_for_two(evidence, candidates, owners)
+            candidates, prices = candidates + list(shared.values()), prices + [prices[k] for k, _ in shared]
+            choices = Choices(problem, [m.T for m in candidates])
+            kept = sorted(choices.best(np.array(prices), parts))
+            owned = choices.labels(kept)
             owners = [(rows[0][owned[0] == i + 1], rows[1][owned[1] == i + 1]) for i in range(len(kept))]
             candidates = [refit(evidence, candidates[k], own) for k, own in zip(kept, owners, strict=True)]
-            shared = one_for_two(evidence, candidates, owners)
+            prices = [prices[k] for k in kept]
         return candidates
 
-    chosen = settled(chosen, config.part_cost)
+    prices = [config.part_cost] * len(chosen)
+    if config.texture.patches:
+        photographs = [photographs_of(g, v, config.texture) for g, v in zip(gaussians, views, strict=True)]
+
+        def said(k: int, owned: Labels) -> float:
+            return against(problem.surfaces, photographs, chosen[k].T, owned, extent, config.texture, seed)
+
+        told = told_apart(Choices(problem, [m.T for m in chosen]), said, config.part_cost, parts)
+        chosen, prices = [chosen[k] for k in told], list(told.values())
+    chosen = settled(chosen, prices)
     # What no joint on the base explains may hang on another part.
     left = np.flatnonzero(costs_of(chosen).min(1) >= config.explained_cost) if chosen else np.zeros(0, int)
     stray = [judging[0][left[left < len(judging[0])]], judging[1][left[left >= len(judging[0])] - len(judging[0])]]
     hanging = propose_hanging(evidence, stray, chosen, lambda motions: costs_of(motions)[left])
     if hanging:
-        more = settled([*chosen, *hanging], config.hanging_cost)
+        more = settled([*chosen, *hanging], [config.hanging_cost] * (len(chosen) + len(hanging)))
         if any(carrier_of(motion, more) is not None for motion in more):
             chosen = more
     problem = Labelling.of(surfaces, extent)
@@ -229,20 +243,21 @@ def segment(
 
 
 def one_for_two(
-    evidence: Evidence, motions: Sequence[Motion], owners: Sequence[tuple[np.ndarray, np.ndarray]]
-) -> list[Motion]:
+    evidence: Evidence, motions: Sequence[Motion], owners: Sequence[Labels]
+) -> dict[tuple[int, int], Motion]:
     """For every two motions that nearly agree on what they own, rows of each state's points: one refined on both.
 
-    A part whose true motion was not among those tried may be shared by one on either side of it.
+    A part whose true motion was not among those tried may be shared by one on either side of it. The first of the two
+    is the one that owns more.
     """
-    shared = []
-    for i, j in combinations(range(len(motions)), 2):
-        both = tuple(np.concatenate(rows) for rows in zip(owners[i], owners[j], strict=True))
+    shared = {}
+    for pair in combinations(range(len(owners)), 2):
+        larger, smaller = sorted(pair, key=lambda k: -sum(map(len, owners[k])))
+        both = tuple(np.concatenate([owners[k][s] for k in pair]) for s in (0, 1))
         points = evidence.surfaces[0].points[both[0]]
-        ends = moved(points, motions[i].T) - moved(points, motions[j].T)
+        ends = moved(points, motions[larger].T) - moved(points, motions[smaller].T)
         if len(points) and np.linalg.norm(ends, axis=1).mean() < ALIKE * evidence.extent:
-            larger = max((i, j), key=lambda k: sum(map(len, owners[k])))
-            shared.append(refit(evidence, motions[larger], (both[0], both[1])))
+            shared[larger, smaller] = refit(evidence, motions[larger], (both[0], both[1]))
     return shared
 
 

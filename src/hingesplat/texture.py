@@ -1,0 +1,170 @@
+"""Whether texture goes where a motion takes it: what tells look-alikes apart.
+
+Of two drawers of a kind, one is open in each state. That the open one went to where the other's is, is a good
+explanation: points meet, colours agree, and nothing hides. But each has a grain of its own. Small squares of what a
+motion carries are laid on the photographs of both states, the motion is corrected a little until they fit, and their
+textures are compared (``patches``).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from hingesplat.capture import View
+from hingesplat.capture.images import downsampled
+from hingesplat.gaussians import Gaussians
+from hingesplat.labelling import Choices
+from hingesplat.patches import CONTRAST, FEWEST, NEAR, Patches, Photograph, adjust, in_common, looks, without_light
+from hingesplat.render import render
+from hingesplat.se3 import from_Rt, moved, rotvec_to_matrix
+from hingesplat.surface import Labels, Surface
+from hingesplat.training import training_view
+
+WIDTH, ROUNDS = 9, 4
+"""Of a patch, in pixels; of the correction."""
+OFF = np.array([0.03, 0.03, 0.03, 0.008, 0.008, 0.008])
+"""How far motions are off that a search has found, radians and extents: standard deviations."""
+AGREED = 0.6
+"""Correlation that speaks neither for a motion nor against it."""
+COST = 1.5
+"""What a point that is short of it by 1 adds to a motion's description length."""
+LEAST, MOST = 0.5, 3.0
+"""Of the price of a motion that texture is not asked about: whatever it says, another is no less and no more."""
+DOUBT = 0.5
+"""Of that price: what texture must say against a motion for others to be looked for."""
+
+
+@dataclass(frozen=True)
+class TextureConfig:
+    """Comparing the texture of what a motion carries."""
+
+    patches: int = 100
+    """Of what a motion carries from each state to the other, at most; 0 leaves look-alikes to points and colours."""
+    views: int = 40
+    """Photographs of each state that are compared, at most."""
+    size: int = 500
+    """Longest side of these photographs, pixels, at most."""
+
+
+def told_apart(
+    choices: Choices, against: Callable[[int, Labels], float], price: float, parts: int | None
+) -> dict[int, float]:
+    """The motions that explain both states at the least description length, texture counting, and their prices.
+
+    It is asked about those chosen. If it speaks against one of them, prices are by what it says, and it is asked about
+    all that might be chosen instead; else it has no say.
+
+    Args:
+        against: what texture says, in points, against the motion of this number, which owns these points (n,) bool of
+            each state.
+        price: of each motion, in points.
+        parts: choose no more than this many.
+    """
+    said: dict[int, float] = {}
+    prices = np.full(choices.number, price)
+    while True:
+        kept = sorted(choices.best(prices, parts))
+        new = [k for k in kept if k not in said]
+        if not new:
+            return {k: float(prices[k]) for k in kept}
+        first, second = choices.labels(kept)
+        for k in new:
+            mine = kept.index(k) + 1
+            said[k] = against(k, (first == mine, second == mine))
+        if max(said.values()) <= DOUBT * price:
+            return dict.fromkeys(kept, price)
+        # What has not been asked about may be as good as any.
+        prices[:] = LEAST * price
+        prices[list(said)] = np.clip(price + np.array(list(said.values())), LEAST * price, MOST * price)
+
+
+@torch.no_grad()
+def photographs_of(gaussians: Gaussians, views: Sequence[View], config: TextureConfig) -> list[Photograph]:
+    """Some photographs of a state, and what the Gaussians fitted to it draw there, as one part 0."""
+    result = []
+    for i in np.linspace(0, len(views) - 1, min(len(views), config.views)).round().astype(int):
+        small = views[i] if max(views[i].rgba.shape) <= config.size else downsampled(views[i], config.size)
+        view = training_view(small)
+        result.append(Photograph.of(view.camera, view.image, render(gaussians, view.camera)))
+    return result
+
+
+def carried(
+    points: np.ndarray,
+    normals: np.ndarray,
+    T_1_0: np.ndarray,
+    photographs: tuple[Sequence[Photograph], Sequence[Photograph]],
+    extent: float,
+) -> np.ndarray:
+    """(m,) correlation between the textures that both states show of a surface, for each patch that has any in both.
+
+    Args:
+        points, normals: (n, 3) of the surface in state 0, where the patches are; either side of it.
+        T_1_0: (4, 4) where it goes in state 1, up to ``OFF``.
+        photographs: of state 0 and of state 1, of part 0.
+    """
+    normals = normals * _outward(points, normals, photographs[0], NEAR * extent)[:, None]
+    pixel = np.median([np.linalg.norm(p.camera.centre - points.mean(0)) / p.camera.fx for p in photographs[0]])
+    patches = Patches.at(0, points, normals, float(pixel), WIDTH)
+    centre = moved(points, T_1_0).mean(0)
+
+    def place(theta: np.ndarray) -> np.ndarray:
+        turn, shift = torch.from_numpy(theta).split(3)
+        about = from_Rt(rotvec_to_matrix(turn), shift * extent).numpy()
+        about[:3, 3] += centre - about[:3, :3] @ centre
+        return np.stack([np.eye(4), about @ T_1_0])
+
+    theta, _ = adjust(patches, photographs, place, np.zeros(6), np.diag(OFF**-2.0), extent, ROUNDS)
+    still = np.zeros((len(points), 3))
+    patch, moves, texture, _ = looks(patches, still, photographs, place(theta), np.zeros((2, 0, 4, 4)), NEAR * extent)
+    if len(patch) == 0:
+        return np.zeros(0)
+    # A patch's photographs lie together, and of these, those of a state.
+    first = np.flatnonzero(np.diff(2 * patch + moves, prepend=-1))
+    count = np.diff(first, append=len(patch))
+    texture, contrast = without_light(texture, np.linalg.qr(patches.slant)[0])
+    common, trust = in_common(texture, first, np.repeat(np.arange(len(first)), count))
+    # Where photographs of one state do not agree among themselves, it is gloss, or noise.
+    sure = (np.add.reduceat(trust, first) >= np.maximum(FEWEST, 0.5 * count)) & (
+        np.add.reduceat(contrast, first) > CONTRAST * count
+    )
+    there = np.flatnonzero((patch[first][:-1] == patch[first][1:]) & sure[:-1] & sure[1:])
+    a, b = common[there], common[there + 1]
+    return (a * b).mean(1) / (a.std(1) * b.std(1))
+
+
+def against(
+    surfaces: tuple[Surface, Surface],
+    photographs: Sequence[Sequence[Photograph]],
+    T_1_0: np.ndarray,
+    owned: Labels,
+    extent: float,
+    config: TextureConfig,
+    seed: int,
+) -> float:
+    """What texture says against a motion of the points owned, (n,) bool of each state, in points; below 0: for it."""
+    total, rng = 0.0, np.random.default_rng(seed)
+    for s, T in enumerate((T_1_0, np.linalg.inv(T_1_0))):
+        rows = rng.permutation(np.flatnonzero(owned[s]))
+        some = surfaces[s].rows(rows[: config.patches])
+        if len(rows):
+            likeness = carried(some.points, some.normals, T, (photographs[s], photographs[1 - s]), extent)
+            total += COST * float((AGREED - likeness).sum()) * len(rows) / len(some.points)
+    return total
+
+
+def _outward(points: np.ndarray, normals: np.ndarray, photographs: Sequence[Photograph], near: float) -> np.ndarray:
+    """(n,) the sign with which normals (n, 3) face the cameras that see the points (n, 3)."""
+    facing = np.zeros(len(points))
+    for photo in photographs:
+        at, depth = photo.camera.project(points)
+        drawn, part = photo.there(at)
+        towards = photo.camera.centre - points
+        cosine = (normals * towards).sum(1) / np.linalg.norm(towards, axis=1)
+        facing += np.where((part == 0) & (np.abs(drawn - depth) < near), cosine, 0)
+    return np.where(facing < 0, -1.0, 1.0)
+
+
+__all__ = ["TextureConfig", "against", "carried", "photographs_of", "told_apart"]
