@@ -619,19 +619,31 @@ def test_of_what_a_fragment_touches_photographs_choose(monkeypatch) -> None:
         assert set(found[625:725]) == {2}
 
 
-@pytest.mark.parametrize(("cost", "own", "label"), [(0.9, 0.1, 1), (0.3, 0.1, 0), (0.9, 0.3, 0)])
+@pytest.mark.parametrize(("costs", "label"), [((0.9, 0.1), 1), ((0.9, 0.3), 1), ((0.3, 0.1), 0)])
 def test_a_fragment_that_the_photographs_are_sure_of_stays_what_it_is(
-    monkeypatch, cost: float, own: float, label: int
+    monkeypatch, costs: tuple[float, float], label: int
 ) -> None:
-    """A knife's blade touches only the handle; ``cost`` is what the photographs say of it if it had stayed there, and
-    ``own`` what they say if it moves: at 0.3, no more than that nobody sees it."""
+    """A knife's blade touches only the handle; it may be what a motion hides (0.3), but it has not stayed there."""
     monkeypatch.setattr(
-        "hingesplat.pieces.label_costs", lambda surface, *_, **__: np.tile([cost, own], (len(surface.points), 1))
+        "hingesplat.pieces.label_costs", lambda surface, *_, **__: np.tile(costs, (len(surface.points), 1))
     )
     surfaces = both_states((PART, SHIFT), (patch((0, 0, -0.95), 14), SHIFT))
     given = np.repeat([0, 1, 1], [400, 225, 196])
     for found in reattach_fragments([SHIFT.T], (given, given), surfaces, 1.0):
         np.testing.assert_array_equal(found, np.repeat([0, 1, label], [400, 225, 196]))
+
+
+@pytest.mark.parametrize(("own", "label"), [(0.1, 1), (0.3, 2)])
+def test_what_another_motion_merely_hides_goes_to_the_part_that_it_touches(monkeypatch, own: float, label: int) -> None:
+    """The handle of a door whose motion is still off: the photographs like it nowhere, and hidden best."""
+    monkeypatch.setattr(
+        "hingesplat.pieces.label_costs", lambda surface, *_, **__: np.tile([1.0, own, 0.9], (len(surface.points), 1))
+    )
+    door, other = patch((0, 1.5, 0.5), 15), replace(SHIFT, value=0.6)
+    surfaces = both_states((PART, SHIFT), (patch((0, 1.5, 0.53), 8), other), (door, other))
+    given = np.repeat([0, 1, 1, 2], [400, 225, 64, 225])
+    for found in reattach_fragments([SHIFT.T, other.T], (given, given), surfaces, 1.0):
+        np.testing.assert_array_equal(found, np.repeat([0, 1, label, 2], [400, 225, 64, 225]))
 
 
 def test_labels_spread_to_the_nearest() -> None:

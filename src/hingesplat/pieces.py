@@ -22,9 +22,9 @@ HINGE = 0.02
 LINKED = 0.25
 """Links across a hinge line that make one part of what lies on both sides, for every point that it is long."""
 SURE = 0.4
-"""A fragment that costs so much more with what it touches, on average, stays what it is, if it is recognised there."""
+"""A fragment that costs so much more with what it touches, on average, stays what it is."""
 RECOGNISED = 0.25
-"""Cost below which it is: what a motion merely hides costs more."""
+"""Cost below which it is recognised where it goes: what a motion merely hides costs more."""
 
 
 def spacing(points: np.ndarray) -> float:
@@ -104,8 +104,8 @@ def reattach_fragments(
     """Small pieces apart from their part's main one go to what they touch, or to the nearest: nothing floats.
 
     Of the parts that a piece touches, photographs choose: the inside of a drawer touches the cabinet and the drawer.
-    They may also be sure that it is neither: a knife's blade touches only the handle that it slides in. Not so the handle
-    of a door whose motion is still off, that the motion of another takes out of sight.
+    They may also be sure that it is neither: a knife's blade touches only the handle that it slides in. Not so the
+    handle of a door whose motion is still off, if the motion of another merely takes it out of sight.
     """
     fragments: list[tuple[int, list[np.ndarray]]] = []
     for k, T in enumerate([np.eye(4), *T_1_0]):
@@ -132,7 +132,7 @@ def reattach_fragments(
         cost = np.concatenate([costs[s][rows[s]] for s in (0, 1)]).mean(0)
         gap = np.concatenate([gaps[s][rows[s]] for s in (0, 1)]).min(0)
         best = int(np.where(gap <= max(TOUCH * extent, gap.min()), cost, np.inf).argmin())
-        if cost[best] - cost[k] < SURE or cost[k] > RECOGNISED:
+        if cost[best] - cost[k] < SURE or (best > 0 and cost[k] > RECOGNISED):
             for s in (0, 1):
                 labels[s][rows[s]] = best
     return labels
