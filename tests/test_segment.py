@@ -12,7 +12,7 @@ import pytest
 from hingesplat.gaussians import concatenate, posed
 from hingesplat.hypotheses import PATCH, HypothesesConfig, axis_directions, distinct, groups_to_try, registered
 from hingesplat.labelling import Choices, Labelling, label_costs, neighbour_weights, seed_costs, shortest, softmax
-from hingesplat.pieces import reattach_fragments, split_pieces
+from hingesplat.pieces import reattach_fragments, seen_in_both, split_pieces
 from hingesplat.render import render
 from hingesplat.screw import prismatic, revolute
 from hingesplat.se3 import moved
@@ -644,6 +644,16 @@ def test_what_another_motion_merely_hides_goes_to_the_part_that_it_touches(monke
     given = np.repeat([0, 1, 1, 2], [400, 225, 64, 225])
     for found in reattach_fragments([SHIFT.T, other.T], (given, given), surfaces, 1.0):
         np.testing.assert_array_equal(found, np.repeat([0, 1, label, 2], [400, 225, 64, 225]))
+
+
+def test_what_is_left_without_points_in_one_state_is_no_part() -> None:
+    """A blade that one state hides but for its tip is one; a speck of noise that was given away to others is not."""
+    motions, first = [SHIFT, inverted(SHIFT), SHIFT], np.repeat([0, 1, 2, 3], [5000, 400, 300, 200])
+    second = np.repeat([0, 1, 2, 3], [5000, 500, 10, 25])
+    found, labels = seen_in_both(motions, (first, second))
+    assert found == [SHIFT, SHIFT] and found[0] is motions[0] and found[1] is motions[2]
+    np.testing.assert_array_equal(labels[0], np.repeat([0, 1, 0, 2], [5000, 400, 300, 200]))
+    np.testing.assert_array_equal(labels[1], np.repeat([0, 1, 0, 2], [5000, 500, 10, 25]))
 
 
 def test_labels_spread_to_the_nearest() -> None:

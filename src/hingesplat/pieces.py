@@ -13,7 +13,7 @@ from hingesplat.surface import Labels, Surface, components
 
 LARGE_PIECE = 0.2
 """A piece this large beside the largest of its part is a part of its own, not a fragment."""
-LEAST_SHARE = 0.001
+LEAST_SHARE = 0.003
 """Of each state's surface: a part that shows less of itself in one of them has no way from there to here."""
 TOUCH = 0.05
 """Extents between points of two parts that touch."""
@@ -136,6 +136,15 @@ def reattach_fragments(
             for s in (0, 1):
                 labels[s][rows[s]] = best
     return labels
+
+
+def seen_in_both(motions: Sequence[Motion], owned: Labels) -> tuple[list[Motion], Labels]:
+    """The parts that both states show something of, and labels that count them; the points of the others are base."""
+    shares = [np.bincount(label, minlength=1 + len(motions))[1:] / len(label) for label in owned]
+    kept = np.flatnonzero(np.minimum(*shares) > LEAST_SHARE)
+    rank = np.zeros(1 + len(motions), int)
+    rank[1 + kept] = np.arange(1, 1 + len(kept))
+    return [motions[k] for k in kept], (rank[owned[0]], rank[owned[1]])
 
 
 def _pieces(

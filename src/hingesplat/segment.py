@@ -28,7 +28,7 @@ from hingesplat.hypotheses import (
     refit,
 )
 from hingesplat.labelling import Choices, Labelling, seed_costs
-from hingesplat.pieces import reattach_fragments, split_pieces
+from hingesplat.pieces import reattach_fragments, seen_in_both, split_pieces
 from hingesplat.se3 import moved
 from hingesplat.search import BASE, Motion, ScoreVolume, carrier_of, inverted, novelty, scan, score_volume
 from hingesplat.stereo import DepthMap
@@ -236,6 +236,7 @@ def segment(
         chosen, owned = pieces
     transforms = [m.T for m in chosen]
     owned = insides(transforms, reattach_fragments(transforms, owned, surfaces, extent), surfaces, extent)
+    chosen, owned = seen_in_both(chosen, owned)
     costs = costs_of(chosen) if chosen else np.ones((1, 1))
     unexplained = float((costs.min(1) >= config.explained_cost).mean())
     labels = tuple(spread_labels(gaussians[s].means.numpy(), surfaces[s], owned[s]) for s in (0, 1))
