@@ -144,7 +144,7 @@ def seen_in_both(motions: Sequence[Motion], owned: Labels) -> tuple[list[Motion]
     kept = np.flatnonzero(np.minimum(*shares) > LEAST_SHARE)
     rank = np.zeros(1 + len(motions), int)
     rank[1 + kept] = np.arange(1, 1 + len(kept))
-    return [motions[k] for k in kept], (rank[owned[0]], rank[owned[1]])
+    return [motions[int(k)] for k in kept], (rank[owned[0]], rank[owned[1]])
 
 
 def _pieces(
