@@ -12,7 +12,7 @@ import pytest
 from hingesplat.gaussians import concatenate, posed
 from hingesplat.hypotheses import PATCH, HypothesesConfig, axis_directions, distinct, groups_to_try, registered
 from hingesplat.labelling import Choices, Labelling, label_costs, neighbour_weights, seed_costs, shortest, softmax
-from hingesplat.pieces import reattach_fragments, seen_in_both, split_pieces
+from hingesplat.pieces import give_way, reattach_fragments, seen_in_both, split_pieces
 from hingesplat.render import render
 from hingesplat.screw import prismatic, revolute
 from hingesplat.se3 import moved
@@ -650,10 +650,30 @@ def test_what_is_left_without_points_in_one_state_is_no_part() -> None:
     """A blade that one state hides but for its tip is one; a speck of noise that was given away to others is not."""
     motions, first = [SHIFT, inverted(SHIFT), SHIFT], np.repeat([0, 1, 2, 3], [5000, 400, 300, 200])
     second = np.repeat([0, 1, 2, 3], [5000, 500, 10, 25])
-    found, labels = seen_in_both(motions, (first, second))
+    found, labels = seen_in_both(motions, (first, second), 25)
     assert found == [SHIFT, SHIFT] and found[0] is motions[0] and found[1] is motions[2]
     np.testing.assert_array_equal(labels[0], np.repeat([0, 1, 0, 2], [5000, 400, 300, 200]))
     np.testing.assert_array_equal(labels[1], np.repeat([0, 1, 0, 2], [5000, 500, 10, 25]))
+    few = np.repeat([0, 1], [20_000, 40])
+    assert seen_in_both([SHIFT], (few, few), 25)[0] == [SHIFT]
+    assert seen_in_both([SHIFT], (few, few), 50)[0] == []
+
+
+def test_what_lands_in_another_drawer_is_of_that_drawer(monkeypatch) -> None:
+    """Two drawers side by side, a cabinet before y = 0 of which photographs see what stays outside. One is open by 0.1,
+    the other by 0.3, and the back of its bottom is thought to take the shorter way."""
+    motions = [prismatic(np.eye(3)[1], 0.1), prismatic(np.eye(3)[1], 0.3)]
+    monkeypatch.setattr("hingesplat.pieces.may_go", lambda surface, _, T: moved(surface.points, T)[:, 1] > -1e-9)
+    x, y = (grid.ravel() for grid in np.meshgrid(np.arange(0, 0.4, 0.01), np.arange(-0.3, 0.05, 0.01)))
+    bottoms = [np.stack([x, y, 0 * x], 1)[y > -0.1], np.stack([x + 0.5, y, 0 * x], 1)]
+    fronts = [np.stack([x + aside, 0 * x, y], 1) for aside in (0, 0.5)]
+    here, there = plain(np.concatenate(bottoms)), plain(np.concatenate(fronts))
+    true = np.repeat([1, 2], [len(bottoms[0]), len(bottoms[1])])
+    second = np.repeat([1, 2], [len(x), len(x)])
+    thought = np.where(here.points[:, 1] > -0.1, 1, true)
+    first, after = give_way(motions, (thought, second), (here, there), 1.0)
+    np.testing.assert_array_equal(first, true)
+    np.testing.assert_array_equal(after, second)
 
 
 def test_labels_spread_to_the_nearest() -> None:

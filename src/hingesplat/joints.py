@@ -272,7 +272,8 @@ def _choose_types(
     confidence = np.zeros(n_joints)
     for j, (slide, turn) in enumerate(_beside_likely(g, sh, thinned(training, JUDGES), tried, ~far)):
         z = gain = 0.0
-        if len(slide):  # Photographs that show the part.
+        judged = len(slide) > 1  # Photographs that show the part; one alone does not scatter.
+        if judged:
             difference = slide - turn
             error = difference.std() / math.sqrt(len(difference)) + 1e-12
             z = float(difference.mean() / error)
@@ -282,7 +283,7 @@ def _choose_types(
         kinds.append("revolute" if hinged else "prismatic")
         # An even verdict between nested models speaks for the slide.
         certainty = z - config.type_significance if hinged else max(config.type_significance - z, 0.0)
-        confidence[j] = 0.5 * (1 + math.erf(certainty / math.sqrt(2)))
+        confidence[j] = 0.5 * (1 + math.erf(judged * certainty / math.sqrt(2)))
     return kinds, confidence
 
 
@@ -368,7 +369,7 @@ def _shared_errors(g: Gaussians, training: Sequence[Sequence[TrainingView]], pos
         spread = math.sqrt(points.var(0).sum()) / poses.extent if len(points) else 1.0
         across = np.linalg.norm(np.cross(points - pivots[j], axes[j]), axis=1) / poses.extent
         lever = math.sqrt(np.mean(across**2)) if len(points) else spread
-        variance[j, :2] = (ALONG * pixel / spread) ** 2 / 2
+        variance[j, :2] = (ALONG * pixel / max(spread, 1e-9)) ** 2 / 2
         variance[j, 2:4] = (ACROSS * pixel) ** 2 / 2
         variance[j, 4:] = (ACROSS * pixel / max(lever, 1e-9) if turns else ALONG * pixel) ** 2
     return variance[:, :, None] * np.eye(variance.shape[1])

@@ -5,7 +5,6 @@ A point's cost under a motion is what the other state's photographs say of the p
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -21,6 +20,10 @@ ARRIVED = 4
 """Views that must see a surface where a motion takes a point, for the point to have been seen there."""
 HIDDEN_SEED_COST = 0.4
 """Cost of a seed that a motion takes out of everybody's sight."""
+SLACK, CLEAR = 0.02, 0.2
+"""Share of the views that may see a point in free space for nothing, and by how much more it is a contradiction."""
+SAME, OTHER = 0.05, 0.5
+"""RGB differences below which colours agree, and by how much more they are wholly different."""
 NOBODY = 0.3
 """What a point without a partner in the other state hears from it, between a partner that disagrees (0) and one that
 agrees (1)."""
@@ -60,14 +63,19 @@ def hidden(surface: Surface, other: Sight, T: np.ndarray | None = None) -> np.nd
     return (contradiction < 0.1) & (arrived < 0.3)
 
 
+def may_go(surface: Surface, other: Sight, T: np.ndarray) -> np.ndarray:
+    """(n,) bool: points that nobody sees through in the other state where T (4, 4) takes them."""
+    return _told(surface, other, T)[0] < 0.1
+
+
 def _told(surface: Surface, other: Sight, T: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What photographs say of points moved by T, (n,) in 0 … 1 each: seen through, seen, and of another colour."""
     answer = ask(surface.points if T is None else moved(surface.points, T), surface.colours, other)
     # A point a little in front of its surface floats in some photographs of its own state, too.
-    contradiction = np.clip((free_share(answer) - surface.free_at_home - 0.02) / 0.2, 0, 1)
+    contradiction = np.clip((free_share(answer) - surface.free_at_home - SLACK) / CLEAR, 0, 1)
     # Every surface is hidden from most sides: a few views that see it there are enough.
     arrived = np.clip(answer[:, SURFACE] / ARRIVED, 0, 1)
-    return contradiction, arrived, np.clip((answer[:, COLOUR] - 0.05) / 0.5, 0, 1)
+    return contradiction, arrived, np.clip((answer[:, COLOUR] - SAME) / OTHER, 0, 1)
 
 
 def seed_costs(
@@ -166,16 +174,18 @@ class Choices:
     def __init__(self, problem: Labelling, T_1_0: Sequence[np.ndarray]) -> None:
         self.problem, self.number = problem, len(T_1_0)
         self._costs, self._partners = problem.costs(T_1_0), problem.partners(T_1_0)
-        # Fewer iterations would leave energies off by as much as one look-alike differs from another.
-        self._solved = cache(self._solve)
+        self._solutions: dict[frozenset[int], tuple[Labels, float]] = {}
 
-    def _solve(self, kept: frozenset[int]) -> tuple[Labels, float]:
+    def _solved(self, kept: frozenset[int]) -> tuple[Labels, float]:
         """Labels that are columns of the costs, and their energy."""
-        columns = [0, *(k + 1 for k in sorted(kept))]
-        (first, second), energy = self.problem.mean_field(
-            [c[:, columns] for c in self._costs], [p[:, columns] for p in self._partners]
-        )
-        return (np.array(columns)[first], np.array(columns)[second]), energy
+        if kept not in self._solutions:
+            columns = [0, *(k + 1 for k in sorted(kept))]
+            # Fewer iterations would leave energies off by as much as one look-alike differs from another.
+            (first, second), energy = self.problem.mean_field(
+                [c[:, columns] for c in self._costs], [p[:, columns] for p in self._partners]
+            )
+            self._solutions[kept] = (np.array(columns)[first], np.array(columns)[second]), energy
+        return self._solutions[kept]
 
     def best(self, prices: np.ndarray, parts: int | None) -> frozenset[int]:
         """The set that explains both states at the least description length: energy and a price for each motion.
@@ -190,7 +200,7 @@ class Choices:
             too_many = 0 if parts is None else max(len(kept) - parts, 0)
             return self._solved(kept)[1] + float(prices[sorted(kept)].sum()) + points * too_many
 
-        return shortest(length, lambda kept: self.promising(kept, prices))
+        return shortest(length, lambda kept: self._promising(kept, prices))
 
     def labels(self, kept: Sequence[int]) -> Labels:
         """Labels of both states' points: 0 stays, i + 1 is to move by ``kept[i]``."""
@@ -199,7 +209,7 @@ class Choices:
         first, second = self._solved(frozenset(kept))[0]
         return rank[first], rank[second]
 
-    def promising(self, kept: frozenset[int], prices: np.ndarray) -> list[int]:
+    def _promising(self, kept: frozenset[int], prices: np.ndarray) -> list[int]:
         """All motions, those first that the points would gain most by if their partners agreed, less their prices."""
         labels, consistency = self._solved(kept)[0], self.problem.consistency
         gain = np.zeros(self.number)

@@ -32,7 +32,7 @@ DEEP, TILTED = 1.2, 0.3
 """How far patches lie off the drawn surface, in pixels, and how much they tilt, as a slope: standard deviations."""
 NEAR = 0.015
 """Extents from the drawn surface within which a patch is on it."""
-ALIKE = 20.0
+COUNT_AS_ONE = 20.0
 """Patches side by side err alike: so many count as one in standard deviations."""
 STEP = 1e-3
 """For derivatives of poses, radians and extents."""
@@ -47,7 +47,7 @@ class PatchConfig:
     width: int = 9
     """Of a patch, in pixels."""
     views: int = 50
-    """Photographs of each state that are matched, at most."""
+    """Photographs of each state that are matched, about."""
     rounds: int = 5
     """Of Gauss-Newton."""
 
@@ -89,7 +89,7 @@ class Photograph:
         return np.stack([ndimage.map_coordinates(s, where, order=1, mode="nearest") for s in self.slope], -1)
 
     def there(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Depth and part at pixel positions (n, m, 2); part −1 outside."""
+        """Depth and part at pixel positions (…, 2); part −1 outside."""
         (height, width), index = self.depth.shape, np.floor(at).astype(int)
         inside = ((index >= 2) & (index < [width - 2, height - 2])).all(-1)
         x, y = np.moveaxis(np.clip(index, 0, [width - 1, height - 1]), -1, 0)
@@ -232,10 +232,17 @@ def looks(
     slopes: np.ndarray,
     tolerance: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs of a patch and a photograph that shows it, those of a patch together.
+    """Pairs of a patch and a photograph that shows it, those of a patch together, in the order of the states.
+
+    Args:
+        local: (n, 3) offset and tilts of the patches.
+        at: (states, 4, 4) where their part is in each state.
+        slopes: (states, p, 4, 4) how that changes with the numbers of the joint.
+        tolerance: how far off what the model draws a patch may be, scene units.
 
     Returns:
-        The patch (pairs,) of each, whether it is of a state but the first (pairs,), and what ``_seen`` gives.
+        The patch (pairs,) of each, whether it is of a state but the first (pairs,), its grey values (pairs, cells), and
+        their derivatives (pairs, cells, 3 + p) by local numbers and by those of the joint.
     """
     pairs = [
         (state, photo, rows)
@@ -358,4 +365,4 @@ def _agreed(
     spread = np.trace(best @ (left.T @ left)) / max(rank, 1)
     inflation = max(1.0, spread * len(pull) / max(len(pull) - rank, 1))
     step = -np.linalg.solve(H / inflation + precision, g / inflation + precision @ off)
-    return step, np.linalg.inv(H / (inflation * ALIKE) + precision)
+    return step, np.linalg.inv(H / (inflation * COUNT_AS_ONE) + precision)

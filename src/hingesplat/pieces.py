@@ -1,11 +1,12 @@
 """One part is one piece: connected pieces of labelled surface points, and what becomes of those apart."""
 
 from collections.abc import Sequence
+from itertools import permutations
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from hingesplat.labelling import label_costs
+from hingesplat.labelling import label_costs, may_go
 from hingesplat.screw import matrix_to_screw
 from hingesplat.se3 import moved
 from hingesplat.search import Motion
@@ -14,13 +15,16 @@ from hingesplat.surface import Labels, Surface, components
 LARGE_PIECE = 0.2
 """A piece this large beside the largest of its part is a part of its own, not a fragment."""
 LEAST_SHARE = 0.003
-"""Of each state's surface: a part that shows less of itself in one of them has no way from there to here."""
+"""Of each state's surface: a part that shows less of itself in one of them has no way from there to here, unless it
+shows as many points as a part must."""
 TOUCH = 0.05
 """Extents between points of two parts that touch."""
 HINGE = 0.02
 """Extents from its hinge line within which nothing tells whether a part is one."""
 LINKED = 0.25
 """Links across a hinge line that make one part of what lies on both sides, for every point that it is long."""
+UPON = 0.01
+"""Extents between points that lie in the same place."""
 SURE = 0.4
 """A fragment that costs so much more with what it touches, on average, stays what it is."""
 RECOGNISED = 0.25
@@ -132,16 +136,41 @@ def reattach_fragments(
         cost = np.concatenate([costs[s][rows[s]] for s in (0, 1)]).mean(0)
         gap = np.concatenate([gaps[s][rows[s]] for s in (0, 1)]).min(0)
         best = int(np.where(gap <= max(TOUCH * extent, gap.min()), cost, np.inf).argmin())
-        if cost[best] - cost[k] < SURE or (best > 0 and cost[k] > RECOGNISED):
+        if cost[best] - cost[k] < SURE or (min(best, k) > 0 and cost[k] > RECOGNISED):
             for s in (0, 1):
                 labels[s][rows[s]] = best
     return labels
 
 
-def seen_in_both(motions: Sequence[Motion], owned: Labels) -> tuple[list[Motion], Labels]:
+def give_way(T_1_0: Sequence[np.ndarray], owned: Labels, surfaces: tuple[Surface, Surface], extent: float) -> Labels:
+    """Labels in which points that land where another part does go along with it, if they may and that part must.
+
+    Of two drawers side by side, each motion hides the other's bottom, too. What took the shorter way into the cabinet
+    lies there in what took the longer, whose front photographs would see if it had taken the shorter.
+    """
+    ways = [list(T_1_0), [np.linalg.inv(T) for T in T_1_0]]
+    may = [[may_go(surfaces[s], surfaces[1 - s].sight, T) for T in ways[s]] for s in (0, 1)]
+    labels = (owned[0].copy(), owned[1].copy())
+    for s in (0, 1):
+        here, there = surfaces[s].points, surfaces[1 - s].points
+        for j, k in permutations(range(len(T_1_0)), 2):
+            loose = np.flatnonzero((owned[s] == j + 1) & may[s][k])
+            firm = moved(here[(owned[s] == k + 1) & ~may[s][j]], ways[s][k])
+            firm = np.concatenate([firm, there[(owned[1 - s] == k + 1) & ~may[1 - s][j]]])
+            if len(loose) == 0 or len(firm) == 0:
+                continue
+            landed, own = moved(here[loose], ways[s][j]), there[owned[1 - s] == j + 1]
+            gap = KDTree(firm).query(landed)[0]
+            met = KDTree(own).query(landed)[0] if len(own) else np.inf
+            labels[s][loose[(gap < UPON * extent) & (gap < met)]] = k + 1
+    return labels
+
+
+def seen_in_both(motions: Sequence[Motion], owned: Labels, min_points: int) -> tuple[list[Motion], Labels]:
     """The parts that both states show something of, and labels that count them; the points of the others are base."""
-    shares = [np.bincount(label, minlength=1 + len(motions))[1:] / len(label) for label in owned]
-    kept = np.flatnonzero(np.minimum(*shares) > LEAST_SHARE)
+    counts = [np.bincount(label, minlength=1 + len(motions))[1:] for label in owned]
+    shown = [c > min(LEAST_SHARE * len(label), min_points - 1) for c, label in zip(counts, owned, strict=True)]
+    kept = np.flatnonzero(shown[0] & shown[1])
     rank = np.zeros(1 + len(motions), int)
     rank[1 + kept] = np.arange(1, 1 + len(kept))
     return [motions[int(k)] for k in kept], (rank[owned[0]], rank[owned[1]])

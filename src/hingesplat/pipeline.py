@@ -54,11 +54,11 @@ from hingesplat.segment import Segmentation, SegmentConfig, segment_states
 from hingesplat.slots import living_slots
 from hingesplat.start import StartConfig, clusters, random_motions
 from hingesplat.stereo import DepthMap, StereoConfig, depth_map, measured, stereo
+from hingesplat.training import Report
 from hingesplat.twin import Joint, Part, Twin
 
 log = logging.getLogger(__name__)
 
-Report = Callable[..., None]
 PresetName = Literal["fast", "standard", "paper"]
 MethodName = Literal["hingesplat", "part2gs", "artgs", "vanilla"]
 
@@ -566,7 +566,7 @@ def _capped(capture: Capture, max_size: int | None) -> Capture:
         return capture
 
     def cap(views: Sequence[View]) -> tuple[View, ...]:
-        return tuple(downsampled(v, max_size) if max(v.rgba.shape[:2]) > max_size else v for v in views)
+        return tuple(downsampled(v, max_size) for v in views)
 
     states = (replace(s, train=cap(s.train), test=cap(s.test)) for s in capture.states)
     return replace(capture, states=tuple(states))

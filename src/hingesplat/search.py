@@ -287,10 +287,11 @@ def inverted(motion: Motion) -> Motion:
 
 
 def carrier_of(motion: Motion, motions: Sequence[Motion]) -> int | None:
-    """Index of the motion that carries this one on; None for one that hangs on the base."""
+    """Index of the motion on the base that carries this one on; None for one that hangs on the base, or on no other."""
     if np.array_equal(motion.after, BASE):
         return None
-    return int(np.argmin([np.inf if m is motion else np.abs(m.T - motion.after).max() for m in motions]))
+    on_base = [k for k, m in enumerate(motions) if np.array_equal(m.after, BASE)]
+    return min(on_base, key=lambda k: float(np.abs(motions[k].T - motion.after).max()), default=None)
 
 
 def scan(

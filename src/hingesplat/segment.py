@@ -1,9 +1,10 @@
 """Which Gaussians move, with which rigid motion, and how many parts that makes. No number of parts is needed.
 
 Seeds are surface points that the other state's cameras would see floating in free space: they must have moved. Every
-motion of one degree of freedom is tried on them (``search``), the fewest motions that explain most seeds are kept
-(description length), and all surface points of both states then vote for a label, each with its neighbours and with
-the place where its label says it went; Gaussians take that of the nearest point.
+motion of one degree of freedom is tried on them (``search``). Surface points of both states vote for a motion, each
+with its neighbours and with the place where it would go (``labelling``); those motions are kept that explain most at
+the least description length, look-alikes told apart by their texture (``texture``). Gaussians take the label of the
+nearest point.
 """
 
 from collections.abc import Sequence
@@ -28,11 +29,11 @@ from hingesplat.hypotheses import (
     refit,
 )
 from hingesplat.labelling import Choices, Labelling, seed_costs
-from hingesplat.pieces import reattach_fragments, seen_in_both, split_pieces
+from hingesplat.pieces import give_way, reattach_fragments, seen_in_both, split_pieces
 from hingesplat.se3 import moved
 from hingesplat.search import BASE, Motion, ScoreVolume, carrier_of, inverted, novelty, scan, score_volume
 from hingesplat.stereo import DepthMap
-from hingesplat.surface import Labels, Surface, bounds, surface_of, thin
+from hingesplat.surface import Pair, Surface, bounds, surface_of, thin
 from hingesplat.texture import TextureConfig, against, photographs_of, told_apart
 from hingesplat.visibility import FREE, HIDDEN, ask
 
@@ -63,7 +64,8 @@ class SegmentConfig:
     hanging_cost: float = 22.0
     """The same where something is left that no joint on the base explains: parts that hang on others are small."""
     min_part_seeds: int = 25
-    """A part must own at least this many seeds."""
+    """Surface points of a part that each state must show, where they are not 0.3 % of it; another piece with the same
+    motion is a part if it shows five times as many."""
     min_left_over: int = 100
     """Seeds that no part known explains from which a further state is searched for more parts."""
     hypotheses: HypothesesConfig = field(default_factory=HypothesesConfig)
@@ -199,7 +201,7 @@ def segment(
 
     def settled(candidates: list[Motion], prices: list[float]) -> list[Motion]:
         """Those of the candidates that there are, refined on what they own."""
-        owners: list[Labels] = []
+        owners: list[Pair] = []
         for _ in range(config.rounds):
             shared = one_for_two(evidence, candidates, owners)
             candidates, prices = candidates + list(shared.values()), prices + [prices[k] for k, _ in shared]
@@ -215,10 +217,10 @@ def segment(
     if config.texture.patches:
         photographs = [photographs_of(g, v, config.texture) for g, v in zip(gaussians, views, strict=True)]
 
-        def said(k: int, owned: Labels) -> float:
-            return against(problem.surfaces, photographs, chosen[k].T, owned, extent, config.texture, seed)
+        def verdict(k: int, mine: Pair) -> float:
+            return against(problem.surfaces, photographs, chosen[k].T, mine, extent, config.texture, seed)
 
-        told = told_apart(Choices(problem, [m.T for m in chosen]), said, config.part_cost, parts)
+        told = told_apart(Choices(problem, [m.T for m in chosen]), verdict, config.part_cost, parts)
         chosen, prices = [chosen[k] for k in told], list(told.values())
     chosen = settled(chosen, prices)
     # What no joint on the base explains may hang on another part.
@@ -235,17 +237,16 @@ def segment(
     if parts is None or len(pieces[0]) <= parts:
         chosen, owned = pieces
     transforms = [m.T for m in chosen]
-    owned = insides(transforms, reattach_fragments(transforms, owned, surfaces, extent), surfaces, extent)
-    chosen, owned = seen_in_both(chosen, owned)
+    owned = give_way(transforms, reattach_fragments(transforms, owned, surfaces, extent), surfaces, extent)
+    owned = insides(transforms, owned, surfaces, extent)
+    chosen, owned = seen_in_both(chosen, owned, config.min_part_seeds)
     costs = costs_of(chosen) if chosen else np.ones((1, 1))
     unexplained = float((costs.min(1) >= config.explained_cost).mean())
     labels = tuple(spread_labels(gaussians[s].means.numpy(), surfaces[s], owned[s]) for s in (0, 1))
     return Segmentation((labels[0], labels[1]), tuple(chosen), unexplained, n_seeds)
 
 
-def one_for_two(
-    evidence: Evidence, motions: Sequence[Motion], owners: Sequence[Labels]
-) -> dict[tuple[int, int], Motion]:
+def one_for_two(evidence: Evidence, motions: Sequence[Motion], owners: Sequence[Pair]) -> dict[tuple[int, int], Motion]:
     """For every two motions that nearly agree on what they own, rows of each state's points: one refined on both.
 
     A part whose true motion was not among those tried may be shared by one on either side of it. The first of the two

@@ -129,7 +129,7 @@ def measured(views: Sequence[View], size: int) -> list[DepthMap]:
     """The depth pictures of a capture, at most ``size`` pixels long; empty for photographs without one."""
     maps = []
     for view in views:
-        small = downsampled(view, min(size, max(view.rgba.shape[:2])))
+        small = downsampled(view, size)
         seen = small.rgba[..., 3] >= 128
         depth = np.zeros(seen.shape) if small.depth is None else np.where(seen & (small.depth > 0), small.depth, 0)
         maps.append(depth_map(view, depth.astype(np.float32)))
@@ -215,7 +215,7 @@ def _vote(points, P, depth, tolerance, same, through, thread, threads):  # pragm
 
 
 def _picture(view: View, size: int) -> Picture:
-    small = downsampled(view, min(size, max(view.rgba.shape[:2])))
+    small = downsampled(view, size)
     rgba = small.rgba.astype(np.float32) / 255
     rgba[..., :3] = rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
     return Picture(small.camera, np.ascontiguousarray(rgba))

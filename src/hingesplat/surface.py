@@ -15,6 +15,8 @@ from hingesplat.register import normals_of
 from hingesplat.stereo import Cloud, DepthMap, cubes, fused, seen_through
 from hingesplat.visibility import FREE, HIDDEN, SURFACE, Sight, ask, look
 
+Pair = tuple[np.ndarray, np.ndarray]
+"""Rows of the surface points of the two states, or a mask (n,) of each."""
 Labels = tuple[np.ndarray, np.ndarray]
 """Part id of every surface point of the two states."""
 

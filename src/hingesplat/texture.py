@@ -7,7 +7,7 @@ textures are compared (``patches``).
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from hingesplat.labelling import Choices
 from hingesplat.patches import CONTRAST, FEWEST, NEAR, Patches, Photograph, adjust, in_common, looks, without_light
 from hingesplat.render import render
 from hingesplat.se3 import from_Rt, moved, rotvec_to_matrix
-from hingesplat.surface import Labels, Surface
+from hingesplat.surface import Pair, Surface
 from hingesplat.training import training_view
 
 WIDTH, ROUNDS = 9, 4
@@ -31,9 +31,9 @@ AGREED = 0.6
 COST = 1.5
 """What a point that is short of it by 1 adds to a motion's description length."""
 LEAST, MOST = 0.5, 3.0
-"""Of the price of a motion that texture is not asked about: whatever it says, another is no less and no more."""
+"""Shares of a motion's price to which texture may lower it, and raise it; what is not asked about yet has the first."""
 DOUBT = 0.5
-"""Of that price: what texture must say against a motion for others to be looked for."""
+"""Share of the price that texture must say against a motion for others to be looked for."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +45,11 @@ class TextureConfig:
     views: int = 40
     """Photographs of each state that are compared, at most."""
     size: int = 500
-    """Longest side of these photographs, pixels, at most."""
+    """Longest side of what they show of the object, pixels, at most."""
 
 
 def told_apart(
-    choices: Choices, against: Callable[[int, Labels], float], price: float, parts: int | None
+    choices: Choices, verdict: Callable[[int, Pair], float], price: float, parts: int | None
 ) -> dict[int, float]:
     """The motions that explain both states at the least description length, texture counting, and their prices.
 
@@ -57,13 +57,13 @@ def told_apart(
     all that might be chosen instead; else it has no say.
 
     Args:
-        against: what texture says, in points, against the motion of this number, which owns these points (n,) bool of
+        verdict: what texture says, in points, against the motion of this number, which owns these points (n,) bool of
             each state.
         price: of each motion, in points.
         parts: choose no more than this many.
     """
     said: dict[int, float] = {}
-    prices = np.full(choices.number, price)
+    prices = np.full(choices.number, price, float)
     while True:
         kept = sorted(choices.best(prices, parts))
         new = [k for k in kept if k not in said]
@@ -72,7 +72,7 @@ def told_apart(
         first, second = choices.labels(kept)
         for k in new:
             mine = kept.index(k) + 1
-            said[k] = against(k, (first == mine, second == mine))
+            said[k] = verdict(k, (first == mine, second == mine))
         if max(said.values()) <= DOUBT * price:
             return dict.fromkeys(kept, price)
         # What has not been asked about may be as good as any.
@@ -85,9 +85,10 @@ def photographs_of(gaussians: Gaussians, views: Sequence[View], config: TextureC
     """Some photographs of a state, and what the Gaussians fitted to it draw there, as one part 0."""
     result = []
     for i in np.linspace(0, len(views) - 1, min(len(views), config.views)).round().astype(int):
-        small = views[i] if max(views[i].rgba.shape) <= config.size else downsampled(views[i], config.size)
-        view = training_view(small)
-        result.append(Photograph.of(view.camera, view.image, render(gaussians, view.camera)))
+        whole = training_view(views[i])
+        cut = replace(views[i], camera=whole.camera, rgba=whole.rgba, depth=None)
+        small = training_view(downsampled(cut, config.size))
+        result.append(Photograph.of(small.camera, small.image, render(gaussians, small.camera)))
     return result
 
 
@@ -101,10 +102,13 @@ def carried(
     """(m,) correlation between the textures that both states show of a surface, for each patch that has any in both.
 
     Args:
-        points, normals: (n, 3) of the surface in state 0, where the patches are; either side of it.
+        points, normals: (n, 3) of the surface in state 0, where the patches are; unit, either side of it.
         T_1_0: (4, 4) where it goes in state 1, up to ``OFF``.
         photographs: of state 0 and of state 1, of part 0.
+        extent: of the object, scene units.
     """
+    if not all(photographs):
+        return np.zeros(0)
     normals = normals * _outward(points, normals, photographs[0], NEAR * extent)[:, None]
     pixel = np.median([np.linalg.norm(p.camera.centre - points.mean(0)) / p.camera.fx for p in photographs[0]])
     patches = Patches.at(0, points, normals, float(pixel), WIDTH)
@@ -139,7 +143,7 @@ def against(
     surfaces: tuple[Surface, Surface],
     photographs: Sequence[Sequence[Photograph]],
     T_1_0: np.ndarray,
-    owned: Labels,
+    owned: Pair,
     extent: float,
     config: TextureConfig,
     seed: int,

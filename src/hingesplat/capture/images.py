@@ -64,16 +64,18 @@ def load_view(frame: Frame, mask: Path | None, forced: bool, max_size: int | Non
         )
     depth = _depth(frame) if with_depth and frame.depth is not None else None
     view = View(frame.camera, rgba, frame.name, depth)
-    return downsampled(view, max_size) if max_size is not None and max(size) > max_size else view
+    return view if max_size is None else downsampled(view, max_size)
 
 
 def downsampled(view: View, max_size: int) -> View:
-    """The view with its longer side ``max_size`` pixels, intrinsics following.
+    """The view with its longer side ``max_size`` pixels at most, intrinsics following.
 
     Exact area filter; colours are weighted by alpha, so the background's colour does not bleed in. Depth is
     sampled, not averaged, since a mean across an edge lies on neither surface.
     """
     height, width = view.rgba.shape[:2]
+    if max(width, height) <= max_size:
+        return view
     scale = max_size / max(width, height)
     w, h = max(1, round(width * scale)), max(1, round(height * scale))
     depth = view.depth
