@@ -34,7 +34,7 @@ from hingesplat.se3 import moved
 from hingesplat.search import BASE, Motion, ScoreVolume, carrier_of, inverted, novelty, scan, score_volume
 from hingesplat.stereo import DepthMap
 from hingesplat.surface import Pair, Surface, bounds, surface_of, thin
-from hingesplat.texture import TextureConfig, against, photographs_of, told_apart
+from hingesplat.texture import TextureConfig, against, fitted, photographs_of, told_apart
 from hingesplat.visibility import FREE, HIDDEN, ask
 
 ALIKE = 0.06
@@ -231,6 +231,13 @@ def segment(
         more = settled([*chosen, *hanging], [config.hanging_cost] * (len(chosen) + len(hanging)))
         if any(carrier_of(motion, more) is not None for motion in more):
             chosen = more
+    if config.texture.patches and not any(carrier_of(m, chosen) is not None for m in chosen):
+        here, label = problem.surfaces[0], problem.labels([m.T for m in chosen])[0]
+        mine = [rng.permutation(np.flatnonzero(label == k + 1)) for k in range(len(chosen))]
+        chosen = [
+            fitted(m, here.rows(own[: config.texture.corrected]), photographs, extent)
+            for m, own in zip(chosen, mine, strict=True)
+        ]
     problem = Labelling.of(surfaces, extent)
     owned = problem.labels([m.T for m in chosen])
     pieces = split_pieces(chosen, owned, surfaces, extent, config.min_part_seeds)

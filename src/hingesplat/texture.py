@@ -18,7 +18,9 @@ from hingesplat.gaussians import Gaussians
 from hingesplat.labelling import Choices
 from hingesplat.patches import CONTRAST, FEWEST, NEAR, Patches, Photograph, adjust, in_common, looks, without_light
 from hingesplat.render import render
+from hingesplat.screw import axes_across
 from hingesplat.se3 import from_Rt, moved, rotvec_to_matrix
+from hingesplat.search import Motion
 from hingesplat.surface import Pair, Surface
 from hingesplat.training import training_view
 
@@ -28,6 +30,8 @@ OFF = np.array([0.03, 0.03, 0.03, 0.008, 0.008, 0.008])
 """How far motions are off that a search has found, radians and extents: standard deviations."""
 AGREED = 0.6
 """Correlation that speaks neither for a motion nor against it."""
+ENOUGH, GOES_ALONG = 5, 0.85
+"""Patches, and the median of their correlations, that make a correction better than what it corrects."""
 COST = 1.5
 """What a point that is short of it by 1 adds to a motion's description length."""
 LEAST, MOST = 0.5, 3.0
@@ -42,6 +46,8 @@ class TextureConfig:
 
     patches: int = 100
     """Of what a motion carries from each state to the other, at most; 0 leaves look-alikes to points and colours."""
+    corrected: int = 300
+    """Of what a motion carries from state 0, at most, when the motion found is corrected by them."""
     views: int = 40
     """Photographs of each state that are compared, at most."""
     size: int = 500
@@ -109,9 +115,6 @@ def carried(
     """
     if not all(photographs):
         return np.zeros(0)
-    normals = normals * _outward(points, normals, photographs[0], NEAR * extent)[:, None]
-    pixel = np.median([np.linalg.norm(p.camera.centre - points.mean(0)) / p.camera.fx for p in photographs[0]])
-    patches = Patches.at(0, points, normals, float(pixel), WIDTH)
     centre = moved(points, T_1_0).mean(0)
 
     def place(theta: np.ndarray) -> np.ndarray:
@@ -120,11 +123,49 @@ def carried(
         about[:3, 3] += centre - about[:3, :3] @ centre
         return np.stack([np.eye(4), about @ T_1_0])
 
-    theta, _ = adjust(patches, photographs, place, np.zeros(6), np.diag(OFF**-2.0), extent, ROUNDS)
+    return _adjusted(points, normals, place, OFF, photographs, extent)[1]
+
+
+def fitted(motion: Motion, surface: Surface, photographs: Sequence[Sequence[Photograph]], extent: float) -> Motion:
+    """The motion, corrected so that the texture of this part of state 0's surface goes along, if then it does."""
+    across, turns = axes_across(motion.axis), motion.kind == "revolute"
+
+    def joint(theta: np.ndarray) -> Motion:
+        axis = motion.axis + theta[:2] @ across
+        pivot = motion.pivot + extent * theta[2:4] @ across
+        value = motion.value + theta[4] * (1 if turns else extent)
+        return replace(motion, axis=axis / np.linalg.norm(axis), pivot=pivot, value=value)
+
+    def place(theta: np.ndarray) -> np.ndarray:
+        return np.stack([np.eye(4), joint(theta).T])
+
+    if len(surface.points) == 0 or not all(photographs):
+        return motion
+    spread = np.array([0.05, 0.05, 0.02, 0.02, 0.05 if turns else 0.02])
+    theta, likeness = _adjusted(surface.points, surface.normals, place, spread, photographs, extent)
+    return joint(theta) if len(likeness) >= ENOUGH and np.median(likeness) > GOES_ALONG else motion
+
+
+def _adjusted(
+    points: np.ndarray,
+    normals: np.ndarray,
+    place: Callable[[np.ndarray], np.ndarray],
+    spread: np.ndarray,
+    photographs: Sequence[Sequence[Photograph]],
+    extent: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers (p,) of the ``place`` (2, 4, 4) in which texture agrees best, about 0 by ``spread`` (p,); and how well.
+
+    That is the correlation (m,) of each patch that has texture in both states.
+    """
+    normals = normals * _outward(points, normals, photographs[0], NEAR * extent)[:, None]
+    pixel = np.median([np.linalg.norm(p.camera.centre - points.mean(0)) / p.camera.fx for p in photographs[0]])
+    patches = Patches.at(0, points, normals, float(pixel), WIDTH)
+    theta, _ = adjust(patches, photographs, place, 0 * spread, np.diag(spread**-2.0), extent, ROUNDS)
     still = np.zeros((len(points), 3))
     patch, moves, texture, _ = looks(patches, still, photographs, place(theta), np.zeros((2, 0, 4, 4)), NEAR * extent)
     if len(patch) == 0:
-        return np.zeros(0)
+        return theta, np.zeros(0)
     # A patch's photographs lie together, and of these, those of a state.
     first = np.flatnonzero(np.diff(2 * patch + moves, prepend=-1))
     count = np.diff(first, append=len(patch))
@@ -136,7 +177,7 @@ def carried(
     )
     there = np.flatnonzero((patch[first][:-1] == patch[first][1:]) & sure[:-1] & sure[1:])
     a, b = common[there], common[there + 1]
-    return (a * b).mean(1) / (a.std(1) * b.std(1))
+    return theta, (a * b).mean(1) / (a.std(1) * b.std(1))
 
 
 def against(
