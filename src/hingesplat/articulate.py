@@ -85,6 +85,7 @@ def articulate(
     *,
     fitted: Sequence[Gaussians] = (),
     maps: Sequence[Sequence[DepthMap]] = (),
+    known: np.ndarray | None = None,
     seed: int = 0,
     device: torch.device | str = "cpu",
     report: Report = lambda **_: None,
@@ -99,6 +100,7 @@ def articulate(
         views: training photographs of every state.
         fitted: each state's own Gaussians; L_art, L_vector and displacements without parts need them.
         maps: the depth of every photograph where it is known.
+        known: (movers,) bool, which first motions need no alignment; none if it is left out.
         device: where to optimise; what comes out is on the CPU.
     """
     rng = np.random.default_rng(seed)
@@ -118,7 +120,9 @@ def articulate(
     optimiser = GaussianAdam(canonical, config.rates, extent, extra | identity.extra | targets.extra)
     training = training_views(views, maps, device)
     if first and config.identity.kind == "hard" and config.align_steps:
-        _align(canonical, poses, training, fitted, extent, config, rng)
+        free = np.ones(parts - 1, bool) if known is None else ~known
+        if free.any():
+            _align(canonical, poses, free, training, fitted, extent, config, rng)
     photographs = shuffled(training, rng)
     statistics = optimiser.fresh_statistics()
     tell = averaged(report, config.steps)
@@ -152,24 +156,26 @@ def articulate(
 def _align(
     canonical: Gaussians,
     poses: PoseDelta,
+    free: np.ndarray,
     training: Sequence[Sequence[TrainingView]],
     fitted: Sequence[Gaussians],
     extent: float,
     config: ArticulateConfig,
     rng: np.random.Generator,
 ) -> None:
-    """Move the parts alone, before anything is painted anew.
+    """Move the parts that are ``free`` (movers,) alone, before anything is painted anew.
 
     What the shape of a part leaves open (a round bar turned about itself) its texture tells, as long as Gaussians have
     not taken on the colours of a wrong pose. A part goes back to where it was if photographs do not like it better, or
     hardly so and its surface comes off that of the ``fitted`` Gaussians: the insides of a door, unseen so far, draw it.
+    (A door that texture had put right, they drew off by 4°, and photographs liked that: its error fell to 0.65.)
     """
     (R, t), off = poses.Rt(), _misfits(canonical, poses, fitted, extent)
     steps, rate = config.align_steps, config.align_rate
     move_parts_alone(canonical, poses, training, steps, rate, config.render.ssim_weight, rng, end=0.1)
     before, after = _mean_errors(canonical, [(R, t), poses.Rt()], thinned(training, JUDGES))
     still_on = _misfits(canonical, poses, fitted, extent) < off + ASTRAY
-    good = (after < BETTER * before) | ((after < before) & still_on)
+    good = free & ((after < BETTER * before) | ((after < before) & still_on))
     with torch.no_grad():
         for correction in poses.parameters:
             correction[:, 1:] *= torch.from_numpy(good).to(correction)[:, None]

@@ -311,7 +311,9 @@ def _segment(run: Run) -> None:
     if run.config.start.motions == "random":
         T_1_0 = random_motions(T_state_0.shape[1], fitted[0].means.numpy(), run.config.start.spread, seed)
         T_state_0 = initial_transforms(T_1_0, len(fitted))
-    _write_start(run, found.labels, other, T_state_0)
+    # What texture says of a motion, it says of one pair of states.
+    settled = [m.by_texture and len(run.views) == 2 and run.config.start.motions == "search" for m in found.motions]
+    _write_start(run, found.labels, other, T_state_0, settled)
     motions = [{k: np.asarray(v).tolist() for k, v in asdict(m).items()} for m in found.motions]
     known = {"states": [0, other], "seeds": found.seeds, "unexplained": found.unexplained, "motions": motions}
     write_json(run / "segmentation.json", known)
@@ -326,7 +328,7 @@ def _start_without_search(run: Run) -> None:
     if config.labels == "clusters":
         labels = clusters(pair, parts, config, run.config.seed)
     T_1_0 = random_motions(parts, pair[0].means.numpy(), config.spread, run.config.seed)
-    _write_start(run, labels, last, initial_transforms(T_1_0, len(run.views)))
+    _write_start(run, labels, last, initial_transforms(T_1_0, len(run.views)), [False] * (parts - 1))
     write_json(run / "segmentation.json", {"states": [0, last], "motions": []})
 
 
@@ -353,10 +355,16 @@ def _without_redundant(
     return replace(found, labels=labels, motions=motions), T_state_0[:, living]
 
 
-def _write_start(run: Run, labels: tuple[np.ndarray, np.ndarray], other: int, T_state_0: np.ndarray) -> None:
-    """Labels of the Gaussians of state 0 and of the state ``other``, and where every part is in each state."""
+def _write_start(
+    run: Run, labels: tuple[np.ndarray, np.ndarray], other: int, T_state_0: np.ndarray, known: Sequence[bool]
+) -> None:
+    """Labels of the Gaussians of state 0 and of the state ``other``, and where every part is in each state.
+
+    ``known`` says of every mover whether that needs no alignment.
+    """
     found = {f"labels_{s}": torch.from_numpy(np.asarray(labels[s], np.int64)) for s in (0, 1)}
     found |= {"other": torch.tensor(other), "T_state_0": torch.from_numpy(T_state_0)}
+    found |= {"known": torch.tensor(known, dtype=torch.bool)}
     write_tensors(run / "segmentation.safetensors", found)
 
 
@@ -385,13 +393,14 @@ def initial_transforms(T_1_0: np.ndarray, states: int) -> np.ndarray:
 
 def _articulate(run: Run) -> None:
     canonical = Gaussians.load(run / "canonical.safetensors")
-    T_state_0 = load_file(run / "segmentation.safetensors")["T_state_0"].numpy()
+    start = load_file(run / "segmentation.safetensors")
+    T_state_0 = start["T_state_0"].numpy()
     moved = Articulation(canonical, T_state_0, torch.zeros(len(T_state_0), len(canonical), 3))
     if T_state_0.shape[1] > 1:
         moved = articulate(
             canonical, T_state_0, run.views, run.config.articulate,
             fitted=[_fitted(run, t) for t in range(len(T_state_0))], maps=_depths(run),
-            seed=run.config.seed, device=run.device, report=run.reporting("articulate"),
+            known=start["known"].numpy() if "known" in start else None, seed=run.config.seed, device=run.device, report=run.reporting("articulate"),
         )  # fmt: skip
     extra = {"T_state_0": torch.from_numpy(np.asarray(moved.T_state_0)), "state_sh": moved.state_sh}
     write_tensors(run / "articulation.safetensors", vars(moved.gaussians) | extra)

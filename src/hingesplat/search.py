@@ -267,12 +267,14 @@ class Motion:
     """Mean score of the seeds, at most 1."""
     after: np.ndarray = field(default_factory=lambda: BASE)
     """(4, 4) where the motion of another part, on which this one hangs, takes it then."""
+    by_texture: bool = False
+    """Whether texture has corrected it: it is right to a fraction of a pixel."""
 
     @staticmethod
     def of(known: Mapping[str, Any]) -> "Motion":
         """From a JSON object of its fields."""
-        lists = {name: np.asarray(known[name], np.float64) for name in ("axis", "pivot", "after")}
-        return Motion(known["kind"], value=known["value"], score=known["score"], **lists)
+        axis, pivot, after = (np.asarray(known[name], np.float64) for name in ("axis", "pivot", "after"))
+        return Motion(known["kind"], axis, pivot, known["value"], known["score"], after, known.get("by_texture", False))
 
     @property
     def T(self) -> np.ndarray:

@@ -134,7 +134,7 @@ def fitted(motion: Motion, surface: Surface, photographs: Sequence[Sequence[Phot
         axis = motion.axis + theta[:2] @ across
         pivot = motion.pivot + extent * theta[2:4] @ across
         value = motion.value + theta[4] * (1 if turns else extent)
-        return replace(motion, axis=axis / np.linalg.norm(axis), pivot=pivot, value=value)
+        return replace(motion, axis=axis / np.linalg.norm(axis), pivot=pivot, value=value, by_texture=True)
 
     def place(theta: np.ndarray) -> np.ndarray:
         return np.stack([np.eye(4), joint(theta).T])
