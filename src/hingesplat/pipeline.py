@@ -400,7 +400,8 @@ def _articulate(run: Run) -> None:
         moved = articulate(
             canonical, T_state_0, run.views, run.config.articulate,
             fitted=[_fitted(run, t) for t in range(len(T_state_0))], maps=_depths(run),
-            known=start["known"].numpy() if "known" in start else None, seed=run.config.seed, device=run.device, report=run.reporting("articulate"),
+            known=start["known"].numpy() if "known" in start else None,
+            seed=run.config.seed, device=run.device, report=run.reporting("articulate"),
         )  # fmt: skip
     extra = {"T_state_0": torch.from_numpy(np.asarray(moved.T_state_0)), "state_sh": moved.state_sh}
     write_tensors(run / "articulation.safetensors", vars(moved.gaussians) | extra)
