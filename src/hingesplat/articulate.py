@@ -174,14 +174,14 @@ def _align(
     there is a second, gentler try.
     """
     for rate in (config.align_rate, config.align_rate / GENTLER):
-        known = [correction.detach().clone() for correction in poses.parameters]
-        Rt, off = [x.detach().clone() for x in poses.Rt()], _misfits(canonical, poses, fitted, extent)
+        were = [correction.detach().clone() for correction in poses.parameters]
+        (R, t), off = poses.Rt(), _misfits(canonical, poses, fitted, extent)
         move_parts_alone(canonical, poses, training, config.align_steps, rate, config.render.ssim_weight, rng, end=0.1)
-        before, after = _mean_errors(canonical, [(Rt[0], Rt[1]), poses.Rt()], thinned(training, JUDGES))
+        before, after = _mean_errors(canonical, [(R, t), poses.Rt()], thinned(training, JUDGES))
         still_on = _misfits(canonical, poses, fitted, extent) < off + ASTRAY
         good = free & ((after < BETTER * before) | ((after < before) & still_on))
         with torch.no_grad():
-            for correction, was in zip(poses.parameters, known, strict=True):
+            for correction, was in zip(poses.parameters, were, strict=True):
                 kept = torch.from_numpy(good).to(correction.device)[:, None]
                 correction[:, 1:] = torch.where(kept, correction[:, 1:], was[:, 1:])
         if good[free].all():

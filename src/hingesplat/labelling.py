@@ -18,6 +18,8 @@ from hingesplat.visibility import COLOUR, SURFACE, Sight, ask
 
 ARRIVED = 4
 """Views that must see a surface where a motion takes a point, for the point to have been seen there."""
+HIDDEN_COST = 0.25
+"""Cost of a point that a motion takes out of everybody's sight."""
 HIDDEN_SEED_COST = 0.4
 """Cost of a seed that a motion takes out of everybody's sight."""
 SLACK, CLEAR = 0.02, 0.2
@@ -37,7 +39,7 @@ def label_costs(
     transforms: Sequence[np.ndarray],
     *,
     extent: float,
-    hidden_cost: float = 0.25,
+    hidden_cost: float = HIDDEN_COST,
     covered_cost: float = 0.15,
     far_cost: float = 0.3,
 ) -> np.ndarray:

@@ -6,7 +6,7 @@ from itertools import permutations
 import numpy as np
 from scipy.spatial import KDTree
 
-from hingesplat.labelling import label_costs, may_go
+from hingesplat.labelling import HIDDEN_COST, label_costs, may_go
 from hingesplat.screw import matrix_to_screw
 from hingesplat.se3 import moved
 from hingesplat.search import Motion
@@ -27,8 +27,6 @@ UPON = 0.01
 """Extents between points that lie in the same place."""
 SURE = 0.4
 """A fragment that costs so much more with what it touches, on average, stays what it is."""
-RECOGNISED = 0.25
-"""Cost below which it is recognised where it goes: what a motion merely hides costs more."""
 
 
 def spacing(points: np.ndarray) -> float:
@@ -136,7 +134,7 @@ def reattach_fragments(
         cost = np.concatenate([costs[s][rows[s]] for s in (0, 1)]).mean(0)
         gap = np.concatenate([gaps[s][rows[s]] for s in (0, 1)]).min(0)
         best = int(np.where(gap <= max(TOUCH * extent, gap.min()), cost, np.inf).argmin())
-        if cost[best] - cost[k] < SURE or (min(best, k) > 0 and cost[k] > RECOGNISED):
+        if cost[best] - cost[k] < SURE or (min(best, k) > 0 and cost[k] > HIDDEN_COST):
             for s in (0, 1):
                 labels[s][rows[s]] = best
     return labels

@@ -35,6 +35,7 @@ from hingesplat.search import BASE, Motion, ScoreVolume, carrier_of, inverted, n
 from hingesplat.stereo import DepthMap
 from hingesplat.surface import Pair, Surface, bounds, surface_of, thin
 from hingesplat.texture import TextureConfig, against, fitted, photographs_of, told_apart
+from hingesplat.training import evenly
 from hingesplat.visibility import FREE, HIDDEN, ask
 
 ALIKE = 0.06
@@ -99,7 +100,7 @@ def survey(
     spacing, tolerance = config.spacing * extent, config.tolerance * extent
     surfaces = []
     for g, v, m in zip(gaussians, views, maps, strict=True):
-        judges = np.linspace(0, len(v) - 1, min(len(v), config.views)).round().astype(int)
+        judges = evenly(len(v), config.views)
         v, m = [v[i] for i in judges], [m[i] for i in judges] if m else []
         surfaces.append(surface_of(g, v, m, config.sight_size, spacing, tolerance))
     return low, high, (surfaces[0], surfaces[1])

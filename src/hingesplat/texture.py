@@ -22,7 +22,7 @@ from hingesplat.screw import axes_across
 from hingesplat.se3 import from_Rt, moved, rotvec_to_matrix
 from hingesplat.search import Motion
 from hingesplat.surface import Pair, Surface
-from hingesplat.training import training_view
+from hingesplat.training import evenly, training_view
 
 WIDTH, ROUNDS = 9, 4
 """Of a patch, in pixels; of the correction."""
@@ -90,7 +90,7 @@ def told_apart(
 def photographs_of(gaussians: Gaussians, views: Sequence[View], config: TextureConfig) -> list[Photograph]:
     """Some photographs of a state, and what the Gaussians fitted to it draw there, as one part 0."""
     result = []
-    for i in np.linspace(0, len(views) - 1, min(len(views), config.views)).round().astype(int):
+    for i in evenly(len(views), config.views):
         whole = training_view(views[i])
         cut = replace(views[i], camera=whole.camera, rgba=whole.rgba, depth=None)
         small = training_view(downsampled(cut, config.size))
@@ -113,8 +113,6 @@ def carried(
         photographs: of state 0 and of state 1, of part 0.
         extent: of the object, scene units.
     """
-    if not all(photographs):
-        return np.zeros(0)
     centre = moved(points, T_1_0).mean(0)
 
     def place(theta: np.ndarray) -> np.ndarray:
@@ -139,8 +137,6 @@ def fitted(motion: Motion, surface: Surface, photographs: Sequence[Sequence[Phot
     def place(theta: np.ndarray) -> np.ndarray:
         return np.stack([np.eye(4), joint(theta).T])
 
-    if len(surface.points) == 0 or not all(photographs):
-        return motion
     spread = np.array([0.05, 0.05, 0.02, 0.02, 0.05 if turns else 0.02])
     theta, likeness = _adjusted(surface.points, surface.normals, place, spread, photographs, extent)
     return joint(theta) if len(likeness) >= ENOUGH and np.median(likeness) > GOES_ALONG else motion
@@ -158,6 +154,8 @@ def _adjusted(
 
     That is the correlation (m,) of each patch that has texture in both states.
     """
+    if len(points) == 0 or not all(photographs):
+        return 0 * spread, np.zeros(0)
     normals = normals * _outward(points, normals, photographs[0], NEAR * extent)[:, None]
     pixel = np.median([np.linalg.norm(p.camera.centre - points.mean(0)) / p.camera.fx for p in photographs[0]])
     patches = Patches.at(0, points, normals, float(pixel), WIDTH)

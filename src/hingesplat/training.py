@@ -159,6 +159,11 @@ def view_loss(
     return loss, error
 
 
+def evenly(number: int, most: int) -> np.ndarray:
+    """Indices of at most ``most`` of so many, the first and the last among them."""
+    return np.linspace(0, number - 1, min(number, most)).round().astype(int)
+
+
 def thinned(states: Sequence[Sequence[TrainingView]], about: int) -> list[Sequence[TrainingView]]:
     """Evenly spread photographs of every state, ``about`` so many of each, to judge by."""
     return [state[:: max(len(state) // about, 1)] for state in states]
