@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +14,9 @@ from hingesplat.simd import (
     INNER,
     LANES,
     Build,
-    parallel,
     psplat,
     pstore_sums,
     sload,
-    sstore,
-    take_ticket,
     vand,
     vany,
     vceil,
@@ -123,46 +119,6 @@ def test_gather_scatter_and_plane_sums():
     np.testing.assert_array_equal(ints, a[1::2].astype(int))
     np.testing.assert_array_equal(sums[:5], LANES * a[:5])
     np.testing.assert_array_equal(sums[5:8], 0)
-
-
-def test_parallel_hands_out_every_ticket_once_even_from_several_threads():
-    @njit(nogil=True)
-    def work(tickets, marks, t, threads):
-        while True:
-            k = take_ticket(tickets)
-            if k >= marks.shape[0]:
-                break
-            sstore(marks, k, sload(marks, k) + 1)
-
-    def caller(marks):
-        parallel(work, 3, np.zeros(1, np.int64), marks)
-
-    arrays = [np.zeros(5000, np.int64) for _ in range(4)]
-    callers = [threading.Thread(target=caller, args=(marks,)) for marks in arrays]
-    for thread in callers:
-        thread.start()
-    for thread in callers:
-        thread.join()
-    for marks in arrays:
-        np.testing.assert_array_equal(marks, 1)
-
-
-def test_parallel_passes_errors_on():
-    def fail(t, threads):
-        if t == 1:
-            raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        parallel(fail, 2)
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
-def test_parallel_works_after_a_fork():
-    parallel(lambda t, threads: None, 2)
-    program = "import os, sys; from hingesplat.simd import parallel\n"
-    program += "f = lambda t, threads: None\nparallel(f, 2)\npid = os.fork()\nparallel(f, 2)\n"
-    program += "sys.exit(os.waitpid(pid, 0)[1] if pid else 0)"
-    subprocess.run([sys.executable, "-W", "ignore", "-c", program], check=True, timeout=60, env=_environment({}))
 
 
 def test_builds_differ_by_source_and_planes(tmp_path):

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -21,7 +22,7 @@ class Camera:
     width: int
     height: int
 
-    @property
+    @cached_property
     def T_camera_world(self) -> np.ndarray:
         """World to camera, 4×4."""
         R, t = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from hingesplat.gaussians import Gaussians
 from hingesplat.se3 import wxyz_to_matrix
-from hingesplat.simd import parallel
+from hingesplat.threads import parallel
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh")
 

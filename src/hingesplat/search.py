@@ -16,7 +16,7 @@ from scipy.ndimage import distance_transform_edt
 
 from hingesplat.screw import joint_motion
 from hingesplat.se3 import moved
-from hingesplat.simd import parallel
+from hingesplat.threads import parallel
 from hingesplat.visibility import FREE, SURFACE, Sight, ask
 
 COLOUR_SCALE = 0.2

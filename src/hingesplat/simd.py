@@ -3,16 +3,15 @@
 Nothing is left to the auto-vectoriser: every operation emits LLVM vector code, which LLVM lowers to AVX-512,
 AVX2, SSE or NEON. ``LANES`` is 16 where the compiler's target has AVX-512, else 8.
 
-The module also holds what every compiled kernel needs besides arithmetic: ``Build`` (a cache identity),
-``parallel`` (threads), and one line in the log when a first call has to compile.
+The module also holds what every compiled kernel needs besides arithmetic: ``Build`` (a cache identity) and one line in
+the log when a first call has to compile.
 """
 
 import hashlib
 import logging
 import operator
-import os
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +37,7 @@ logger = logging.getLogger("hingesplat")
 intrinsic: Any = numba.extending.intrinsic  # it drops the first parameter, which a type checker cannot know
 
 
-# ---- compiling, caching, threads -----------------------------------------------------------------------
+# ---- compiling, caching --------------------------------------------------------------------------------
 
 # Without "nnan" and "ninf": comparisons must still reject what is not finite.
 FAST_MATH = ("nsz", "arcp", "contract", "reassoc", "afn")
@@ -76,8 +75,9 @@ class Build:
         identity = f"{hingesplat.__version__}, {LANES} lanes, source {digest.hexdigest()[:16]}"
         self.type = BuildType(identity, planes)
 
+    @cache
     def with_planes(self, planes: int) -> "Build":
-        """The same build, specialised on another number of planes."""
+        """The same build, specialised on another number of planes. Kept: Numba is slow with types new to it."""
         other = object.__new__(Build)
         other.type = BuildType(self.type.identity, planes)
         return other
@@ -117,33 +117,6 @@ class _CompileNotice(event.Listener):
 
 
 event.register("numba:compile", _CompileNotice())
-
-
-_pool: ThreadPoolExecutor | None = None
-
-
-def _drop_pool() -> None:
-    global _pool
-    _pool = None
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_drop_pool)  # a forked child has the pool but not its threads
-
-
-def parallel(kernel: Callable[..., Any], threads: int, *args: Any) -> None:
-    """Run ``kernel(*args, t, threads)`` for t = 0 … threads - 1 at once; the kernel must release the GIL.
-
-    Plain Python threads instead of a Numba threading layer: they sleep instead of spinning, may be entered
-    from several threads, survive a fork, and leave torch's thread count alone.
-    """
-    global _pool
-    if threads > 1 and _pool is None:
-        _pool = ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="hingesplat")
-    others = [_pool.submit(kernel, *args, t, threads) for t in range(1, threads)] if _pool else []
-    kernel(*args, 0, threads)
-    for other in others:
-        other.result()
 
 
 # ---- the vector type -----------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from hingesplat.camera import Camera
 from hingesplat.capture import View, visual_hull
 from hingesplat.capture.images import downsampled
-from hingesplat.simd import parallel
+from hingesplat.threads import parallel
 
 
 @dataclass(frozen=True)

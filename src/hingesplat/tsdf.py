@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from hingesplat.camera import Camera
-from hingesplat.simd import parallel
+from hingesplat.threads import parallel
 
 WALL, DEEP = np.float32(2.0), np.float32(0.001)
 """How much lying just behind the part's own surface says for being inside, and lying farther behind, beside the 1 of a

@@ -17,8 +17,8 @@ from hingesplat.camera import Camera
 from hingesplat.capture import View
 from hingesplat.gaussians import Gaussians
 from hingesplat.render import render
-from hingesplat.simd import parallel
 from hingesplat.stereo import DepthMap, seen_through, witnesses
+from hingesplat.threads import parallel
 
 FREE, SURFACE, HIDDEN, COLOUR = range(4)
 """Columns of ``ask``'s answer."""

@@ -19,7 +19,6 @@ from hingesplat.simd import (
     KERNEL,
     LANES,
     Build,
-    parallel,
     sload,
     sstore,
     vfma,
@@ -32,6 +31,7 @@ from hingesplat.simd import (
     vstore,
     vsum,
 )
+from hingesplat.threads import parallel
 
 WINDOW_SIGMA = 1.5
 RADIUS = 5

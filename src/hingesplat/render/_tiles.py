@@ -62,7 +62,7 @@ def count_segments(first, last, boxes, segments, histogram, width):
 
 
 @njit(**KERNEL)
-def sort_and_offset(build, segments, record, stride, histogram, order, scratch, offsets, starts):
+def sort_and_offset(build, segments, record, stride, histogram, order, offsets, starts):
     """Sort the visible Gaussians by depth (stable, exact) into ``order``; lay out slots and tile lists.
 
     ``offsets`` (n + 1,) are the first slots of the Gaussians, ``starts`` (tiles + 1,) the first list entries
@@ -70,35 +70,34 @@ def sort_and_offset(build, segments, record, stride, histogram, order, scratch, 
     """
     n, visible, total = segments.shape[0], 0, 0
     low, high = np.int64(2**31), np.int64(0)
+    source, target = np.empty(n, np.int64), np.empty(n, np.int64)  # depth and index in one: one memory access a pass
     for i in range(n):
         offsets[i] = total
         if segments[i] > 0:
             total += segments[i]
-            key = float_bits(sload(record, i * stride + REC_DEPTH))
+            key = np.int64(float_bits(sload(record, i * stride + REC_DEPTH)))
             low, high = min(low, key), max(high, key)
-            order[visible] = i
+            source[visible] = (key << 32) | i
             visible += 1
     offsets[n] = total
 
-    source, target = order, scratch
     counts = np.empty(1 << _DIGIT, np.int64)
     shift = 0
     while visible > 0 and (high - low) >> shift > 0:
         counts[:] = 0
         for j in range(visible):
-            key = float_bits(sload(record, source[j] * stride + REC_DEPTH)) - low
-            counts[(key >> shift) & ((1 << _DIGIT) - 1)] += 1
+            counts[(((source[j] >> 32) - low) >> shift) & ((1 << _DIGIT) - 1)] += 1
         position = 0
         for digit in range(1 << _DIGIT):
             position, counts[digit] = position + counts[digit], position
         for j in range(visible):
-            key = float_bits(sload(record, source[j] * stride + REC_DEPTH)) - low
-            digit = (key >> shift) & ((1 << _DIGIT) - 1)
+            digit = (((source[j] >> 32) - low) >> shift) & ((1 << _DIGIT) - 1)
             target[counts[digit]] = source[j]
             counts[digit] += 1
         source, target = target, source
         shift += _DIGIT
-    order[:visible] = source[:visible]
+    for j in range(visible):
+        order[j] = source[j] & 0x7FFFFFFF
 
     position = 0
     for tile in range(starts.shape[0] - 1):

@@ -18,7 +18,8 @@ from hingesplat.render._blend import blend, unblend
 from hingesplat.render._project import SUM_FEATURES, View, project, record_screen_gradient, unproject
 from hingesplat.render._tiles import REC_FEATURES, TILE, fill_lists, sort_and_offset
 from hingesplat.render.torch_backend import NEAR, TRANSMITTANCE_MIN, tangent_limits
-from hingesplat.simd import LANES, Build, parallel
+from hingesplat.simd import LANES, Build
+from hingesplat.threads import parallel
 
 CHANNEL_SIZES = (0, 1, 4, 8, 16)
 """Numbers of channels that kernels are compiled for; others are padded up, more take several passes."""
@@ -136,9 +137,9 @@ def _draw(
     flat = [a.reshape(-1) for a in (*geometry, colors, channels)]
     parallel(project, threads, _BUILD, *flat, view, record, boxes, segments, histogram)
 
-    order, scratch, offsets = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n + 1, np.int64)
+    order, offsets = np.empty(n, np.int32), np.empty(n + 1, np.int64)
     starts = np.empty(columns * rows + 1, np.int64)
-    visible, total = sort_and_offset(_BUILD, segments, record, stride, histogram, order, scratch, offsets, starts)
+    visible, total = sort_and_offset(_BUILD, segments, record, stride, histogram, order, offsets, starts)
     items, slots, shapes = (np.empty(total, np.int32) for _ in range(3))
     lists = (record, stride, offsets, starts, columns, items, slots, shapes)
     parallel(fill_lists, threads, _BUILD, visible, order, boxes, *lists)

@@ -10,7 +10,7 @@ from hingesplat.camera import Camera
 from hingesplat.gaussians import SH_C0, Gaussians
 from hingesplat.render._place import place_backward, place_forward
 from hingesplat.se3 import matrix_to_wxyz, quat_multiply
-from hingesplat.simd import parallel
+from hingesplat.threads import parallel
 
 GAUSSIANS_PER_THREAD = 16_384
 """With fewer, another thread costs more than it brings."""
