@@ -11,7 +11,6 @@ import hashlib
 import logging
 import operator
 from collections.abc import Iterable
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -75,9 +74,8 @@ class Build:
         identity = f"{hingesplat.__version__}, {LANES} lanes, source {digest.hexdigest()[:16]}"
         self.type = BuildType(identity, planes)
 
-    @cache
     def with_planes(self, planes: int) -> "Build":
-        """The same build, specialised on another number of planes. Kept: Numba is slow with types new to it."""
+        """The same build, specialised on another number of planes."""
         other = object.__new__(Build)
         other.type = BuildType(self.type.identity, planes)
         return other

@@ -77,6 +77,7 @@ _LOG2_E, _LN_2 = np.float32(math.log2(math.e)), np.float32(math.log(2))
 _LOG2_ALPHA_MIN = np.float32(math.log2(ALPHA_MIN))
 _TINY = np.float32(1e-6)  # keeps logarithms and divisions finite where the result is not used
 _DET_MIN = np.float32(1e-12)
+_SAMPLE = 64  # depths that tell where to cut
 
 # log2(1 + m) ≈ m·(P0 + P1·m + …) on [0, 1), minimax fit, error below 2e-7.
 _P0, _P1, _P2, _P3, _P4, _P5, _P6 = (
@@ -243,6 +244,24 @@ def _copy_features(i, colors, channels, count, record, stride):
         sstore(record, q, _0)
 
 
+@njit(**INNER)
+def _slice_depths(means, view, sample, pivots):
+    """Depths that cut the Gaussians into slices of about as many each. Every thread finds the same."""
+    n = means.shape[0] // 3
+    for k in range(_SAMPLE):
+        i = 3 * (k * n // _SAMPLE)
+        depth = view[_T + 2]
+        for axis in range(3):
+            depth += view[_R + 6 + axis] * means[i + axis]
+        j = k
+        while j > 0 and sample[j - 1] > depth:
+            sample[j] = sample[j - 1]
+            j -= 1
+        sample[j] = depth
+    for k in range(pivots.shape[0]):
+        pivots[k] = sample[(k + 1) * _SAMPLE // (pivots.shape[0] + 1)]
+
+
 @njit(**KERNEL)
 def project(
     build,
@@ -256,12 +275,17 @@ def project(
     record,
     boxes,
     segments,
+    pivots,
     histogram,
     t,
     threads,
 ):
-    """Fill the records and boxes; count the segments of each Gaussian and, in histogram[t], of each tile."""
+    """Fill the records and boxes; count the segments of each Gaussian and, in histogram[t], of each tile.
+
+    These are counted in slices of depth, for ``fill_lists``; ``pivots`` (threads - 1,) become their bounds.
+    """
     n = opacities.shape[0]
+    _slice_depths(means, view, np.empty(_SAMPLE, np.float32), pivots)
     count, stride = channels.shape[0] // n, record.shape[0] // n
     blocks = (n + LANES - 1) // LANES
     first, last = t * blocks // threads * LANES, min((t + 1) * blocks // threads * LANES, n)
@@ -269,7 +293,7 @@ def project(
         _project_block(min(i, n - LANES), means, quats, scales, opacities, view, record, stride, boxes)
     for i in range(first, last):
         _copy_features(i, colors, channels, count, record, stride)
-    count_segments(first, last, boxes, segments, histogram[t], int(view[_WIDTH]))
+    count_segments(first, last, boxes, record, stride, pivots, segments, histogram[t], int(view[_WIDTH]))
 
 
 @njit(**INNER)

@@ -43,19 +43,29 @@ def _segments_in_column(x0, x1, column):
 
 
 @njit(**INNER)
-def count_segments(first, last, boxes, segments, histogram, width):
-    """segments[i] for first ≤ i < last; adds them to the histogram of the tiles."""
+def slice_of(depth, pivots):
+    """Which slice of depths this one lies in: each begins at a pivot."""
+    k = 0
+    while k < pivots.shape[0] and sload(pivots, k) <= depth:
+        k += 1
+    return k
+
+
+@njit(**INNER)
+def count_segments(first, last, boxes, record, stride, pivots, segments, histogram, width):
+    """segments[i] for first ≤ i < last; adds them to the histogram (slices of depth, tiles)."""
     columns = (width + TILE - 1) // TILE
     for i in range(first, last):
         x0, x1 = sload(boxes, 4 * i), sload(boxes, 4 * i + 1)
         total = 0
         if x1 >= x0:
+            base = slice_of(sload(record, i * stride + REC_DEPTH), pivots) * histogram.shape[1]
             row0, row1 = tile_of(sload(boxes, 4 * i + 2)), tile_of(sload(boxes, 4 * i + 3))
             for column in range(tile_of(x0), tile_of(x1) + 1):
                 count = _segments_in_column(x0, x1, column)
                 total += count
                 for row in range(row0, row1 + 1):  # a range in steps would divide
-                    tile = row * columns + column
+                    tile = base + row * columns + column
                     sstore(histogram, tile, sload(histogram, tile) + count)
             total *= row1 - row0 + 1
         sstore(segments, i, total)
@@ -103,7 +113,8 @@ def sort_and_offset(build, segments, record, stride, histogram, order, offsets, 
     for tile in range(starts.shape[0] - 1):
         starts[tile] = position
         for t in range(histogram.shape[0]):
-            position += histogram[t, tile]
+            for k in range(histogram.shape[1]):
+                position += histogram[t, k, tile]
     starts[starts.shape[0] - 1] = position
     return visible, total
 
@@ -131,8 +142,8 @@ def pack(x, y, rows):
 
 
 @njit(**INNER)
-def _list_segments(g, box, row0, row1, columns, record, stride, slot0, cursor, base, items, slots, shapes):
-    """Append the segments of Gaussian g in the tile rows row0 … row1 - 1 to the lists of their tiles."""
+def _list_segments(g, box, columns, record, stride, slot0, cursor, items, slots, shapes):
+    """Append the segments of Gaussian g to the lists of their tiles."""
     x0, x1, y0, y1 = box
     o = g * stride
     mx, my = sload(record, o + REC_X), sload(record, o + REC_Y)
@@ -151,12 +162,12 @@ def _list_segments(g, box, row0, row1, columns, record, stride, slot0, cursor, b
             bottom, top = _slab(a, b, c, spread, reach_x, reach_y, left, right)
             low = max(y0, math.ceil(my + bottom - _HALF))
             high = min(y1, math.floor(my + top - _HALF))
-            for row in range(max(first_row, row0), min(last_row + 1, row1)):
+            for row in range(first_row, last_row + 1):
                 start = max(low, row * TILE)
                 rows = max(min(high, row * TILE + TILE - 1) - start + 1, 0)
                 if rows == 0:
                     start = row * TILE
-                tile = row * columns + column - base
+                tile = row * columns + column
                 p = cursor[tile]
                 cursor[tile] = p + 1
                 sstore(items, p, g)
@@ -165,38 +176,43 @@ def _list_segments(g, box, row0, row1, columns, record, stride, slot0, cursor, b
             done += 1
 
 
+@njit(**INNER)
+def _before(depth, order, visible, record, stride):
+    """How many of the sorted Gaussians lie before this depth."""
+    low, high = 0, visible
+    while low < high:
+        middle = (low + high) >> 1
+        if sload(record, np.int64(sload(order, middle)) * stride + REC_DEPTH) < depth:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
 @njit(**KERNEL)
 def fill_lists(
-    build, visible, order, boxes, record, stride, offsets, starts, columns, items, slots, shapes, t, threads
-):
-    """Write the lists of the tiles, front to back; thread t takes tile rows with its share of the work."""
-    rows = (starts.shape[0] - 1) // columns
-    total = starts[rows * columns]
-    row0 = 0
-    while t > 0 and row0 < rows and starts[row0 * columns] < total * t // threads:
-        row0 += 1
-    row1 = row0 if t < threads - 1 else rows
-    while row1 < rows and starts[row1 * columns] < total * (t + 1) // threads:
-        row1 += 1
-    if row0 >= row1:
-        return
-    base = row0 * columns
-    cursor = starts[base : row1 * columns].copy()
-    for j in range(visible):
+    build, visible, order, boxes, record, stride, offsets, pivots, histogram, starts, columns, items, slots, shapes,
+    t, threads,
+):  # fmt: skip
+    """Write the lists of the tiles, front to back; thread t takes a slice of depths."""
+    cursor = starts.copy()
+    for tile in range(histogram.shape[2]):
+        for k in range(t):
+            for other in range(threads):
+                cursor[tile] += histogram[other, k, tile]
+    first = _before(pivots[t - 1], order, visible, record, stride) if t > 0 else 0
+    last = _before(pivots[t], order, visible, record, stride) if t < threads - 1 else visible
+    for j in range(first, last):
         g = np.int64(sload(order, j))
-        y0, y1 = np.int64(sload(boxes, 4 * g + 2)), np.int64(sload(boxes, 4 * g + 3))
-        first, last = tile_of(y0), tile_of(y1)
-        if first >= row1 or last < row0:
-            continue
         x0, x1 = np.int64(sload(boxes, 4 * g)), np.int64(sload(boxes, 4 * g + 1))
+        y0, y1 = np.int64(sload(boxes, 4 * g + 2)), np.int64(sload(boxes, 4 * g + 3))
         slot0 = np.int64(sload(offsets, g))
-        if tile_of(x0) == tile_of(x1) and first == last and x1 - x0 < LANES:  # the common case
-            tile = first * columns + tile_of(x0) - base
+        if tile_of(x0) == tile_of(x1) and tile_of(y0) == tile_of(y1) and x1 - x0 < LANES:  # the common case
+            tile = tile_of(y0) * columns + tile_of(x0)
             p = cursor[tile]
             cursor[tile] = p + 1
             sstore(items, p, g)
             sstore(slots, p, slot0)
             sstore(shapes, p, pack(x0 % TILE, y0 % TILE, y1 - y0 + 1))
         else:
-            box = (x0, x1, y0, y1)
-            _list_segments(g, box, row0, row1, columns, record, stride, slot0, cursor, base, items, slots, shapes)
+            _list_segments(g, (x0, x1, y0, y1), columns, record, stride, slot0, cursor, items, slots, shapes)

@@ -133,15 +133,16 @@ def _draw(
     stride = -(-(REC_FEATURES + planes) // 4) * 4
 
     record, boxes = np.empty(n * stride, np.float32), np.empty(4 * n, np.int32)
-    segments, histogram = np.empty(n, np.int32), np.zeros((threads, columns * rows), np.int64)
+    segments, pivots = np.empty(n, np.int32), np.empty(threads - 1, np.float32)
+    histogram = np.zeros((threads, threads, columns * rows), np.int64)
     flat = [a.reshape(-1) for a in (*geometry, colors, channels)]
-    parallel(project, threads, _BUILD, *flat, view, record, boxes, segments, histogram)
+    parallel(project, threads, _BUILD, *flat, view, record, boxes, segments, pivots, histogram)
 
     order, offsets = np.empty(n, np.int32), np.empty(n + 1, np.int64)
     starts = np.empty(columns * rows + 1, np.int64)
     visible, total = sort_and_offset(_BUILD, segments, record, stride, histogram, order, offsets, starts)
     items, slots, shapes = (np.empty(total, np.int32) for _ in range(3))
-    lists = (record, stride, offsets, starts, columns, items, slots, shapes)
+    lists = (record, stride, offsets, pivots, histogram, starts, columns, items, slots, shapes)
     parallel(fill_lists, threads, _BUILD, visible, order, boxes, *lists)
     tiles = np.argsort(starts[:-1] - starts[1:], kind="stable")  # the longest lists first, for balance
 
