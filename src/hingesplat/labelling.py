@@ -70,6 +70,12 @@ def may_go(surface: Surface, other: Sight, T: np.ndarray) -> np.ndarray:
     return _told(surface, other, T)[0] < 0.1
 
 
+def gone(surface: Surface, other: Sight) -> np.ndarray:
+    """(n,) bool: points in whose place the other state's photographs show nothing, or another colour."""
+    contradiction, arrived, colour = _told(surface, other, None)
+    return ((contradiction >= 0.5) & (arrived < 0.3)) | (arrived * colour > 0.3)
+
+
 def _told(surface: Surface, other: Sight, T: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What photographs say of points moved by T, (n,) in 0 … 1 each: seen through, seen, and of another colour."""
     answer = ask(surface.points if T is None else moved(surface.points, T), surface.colours, other)
@@ -203,6 +209,12 @@ class Choices:
             return self._solved(kept)[1] + float(prices[sorted(kept)].sum()) + points * too_many
 
         return shortest(length, lambda kept: self._promising(kept, prices))
+
+    def gains(self, kept: frozenset[int]) -> dict[int, float]:
+        """What each of the most promising others would explain besides these, in points; the best first."""
+        others = [k for k in self._promising(kept, np.zeros(self.number)) if k not in kept][:ADDED]
+        gain = {k: self._solved(kept)[1] - self._solved(kept | {k})[1] for k in others}
+        return dict(sorted(gain.items(), key=lambda item: -item[1]))
 
     def labels(self, kept: Sequence[int]) -> Labels:
         """Labels of both states' points: 0 stays, i + 1 is to move by ``kept[i]``."""

@@ -6,7 +6,7 @@ from itertools import permutations
 import numpy as np
 from scipy.spatial import KDTree
 
-from hingesplat.labelling import HIDDEN_COST, label_costs, may_go
+from hingesplat.labelling import HIDDEN_COST, gone, label_costs, may_go
 from hingesplat.screw import matrix_to_screw
 from hingesplat.se3 import moved
 from hingesplat.search import Motion
@@ -23,6 +23,8 @@ HINGE = 0.02
 """Extents from its hinge line within which nothing tells whether a part is one."""
 LINKED = 0.25
 """Links across a hinge line that make one part of what lies on both sides, for every point that it is long."""
+GONE = 0.3
+"""Share of a part's points that one of the states at least must show to have gone."""
 UPON = 0.01
 """Extents between points that lie in the same place."""
 SURE = 0.4
@@ -164,11 +166,21 @@ def give_way(T_1_0: Sequence[np.ndarray], owned: Labels, surfaces: tuple[Surface
     return labels
 
 
-def seen_in_both(motions: Sequence[Motion], owned: Labels, min_points: int) -> tuple[list[Motion], Labels]:
-    """The parts that both states show something of, and labels that count them; the points of the others are base."""
+def seen_to_move(
+    motions: Sequence[Motion], owned: Labels, surfaces: tuple[Surface, Surface], min_points: int
+) -> tuple[list[Motion], Labels]:
+    """The parts that both states show, and one at least where they have gone; labels that count these.
+
+    The points of the others are base: walls without texture, of which two states' depth differs, that a slight turn
+    would explain.
+    """
     counts = [np.bincount(label, minlength=1 + len(motions))[1:] for label in owned]
     shown = [c > min(LEAST_SHARE * len(label), min_points - 1) for c, label in zip(counts, owned, strict=True)]
-    kept = np.flatnonzero(shown[0] & shown[1])
+    went = [gone(surfaces[s], surfaces[1 - s].sight) for s in (0, 1)]
+    share = [
+        np.bincount(o, g, 1 + len(motions))[1:] / np.maximum(c, 1) for o, g, c in zip(owned, went, counts, strict=True)
+    ]
+    kept = np.flatnonzero(shown[0] & shown[1] & (np.maximum(*share) > GONE))
     rank = np.zeros(1 + len(motions), int)
     rank[1 + kept] = np.arange(1, 1 + len(kept))
     return [motions[int(k)] for k in kept], (rank[owned[0]], rank[owned[1]])

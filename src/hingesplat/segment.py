@@ -29,12 +29,21 @@ from hingesplat.hypotheses import (
     refit,
 )
 from hingesplat.labelling import Choices, Labelling, seed_costs
-from hingesplat.pieces import give_way, reattach_fragments, seen_in_both, split_pieces
+from hingesplat.pieces import give_way, reattach_fragments, seen_to_move, split_pieces
 from hingesplat.se3 import moved
 from hingesplat.search import BASE, Motion, ScoreVolume, carrier_of, inverted, novelty, scan, score_volume
 from hingesplat.stereo import DepthMap
 from hingesplat.surface import Pair, Surface, bounds, surface_of, thin
-from hingesplat.texture import TextureConfig, against, fitted, photographs_of, told_apart
+from hingesplat.texture import (
+    TextureConfig,
+    against,
+    agreeing,
+    compared,
+    fitted,
+    photographs_of,
+    told_apart,
+    vouched_for,
+)
 from hingesplat.training import evenly
 from hingesplat.visibility import FREE, HIDDEN, ask
 
@@ -218,10 +227,14 @@ def segment(
     if config.texture.patches:
         photographs = [photographs_of(g, v, config.texture) for g, v in zip(gaussians, views, strict=True)]
 
-        def verdict(k: int, mine: Pair) -> float:
-            return against(problem.surfaces, photographs, chosen[k].T, mine, extent, config.texture, seed)
+        def texture(k: int | None, mine: Pair) -> list[tuple[np.ndarray, float]]:
+            T_1_0 = BASE if k is None else ways[k]
+            return compared(problem.surfaces, photographs, T_1_0, mine, extent, config.texture, seed)
 
-        told = told_apart(Choices(problem, [m.T for m in chosen]), verdict, config.part_cost, parts)
+        ways = [m.T for m in chosen]
+        choices = Choices(problem, ways)
+        told = told_apart(choices, lambda *asked: against(texture(*asked)), config.part_cost, parts)
+        told = vouched_for(choices, told, lambda *asked: agreeing(texture(*asked)), config.part_cost, parts)
         chosen, prices = [chosen[k] for k in told], list(told.values())
     chosen = settled(chosen, prices)
     # What no joint on the base explains may hang on another part.
@@ -247,7 +260,7 @@ def segment(
     transforms = [m.T for m in chosen]
     owned = give_way(transforms, reattach_fragments(transforms, owned, surfaces, extent), surfaces, extent)
     owned = insides(transforms, owned, surfaces, extent)
-    chosen, owned = seen_in_both(chosen, owned, config.min_part_seeds)
+    chosen, owned = seen_to_move(chosen, owned, surfaces, config.min_part_seeds)
     costs = costs_of(chosen) if chosen else np.ones((1, 1))
     unexplained = float((costs.min(1) >= config.explained_cost).mean())
     labels = tuple(spread_labels(gaussians[s].means.numpy(), surfaces[s], owned[s]) for s in (0, 1))

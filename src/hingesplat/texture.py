@@ -36,6 +36,8 @@ COST = 1.5
 """What a point that is short of it by 1 adds to a motion's description length."""
 LEAST, MOST = 0.5, 3.0
 """Shares of a motion's price to which texture may lower it, and raise it; what is not asked about yet has the first."""
+OTHERWISE = 0.3
+"""Share of the patches that go along with a motion of which fewer may go along with any other, for it to be theirs."""
 DOUBT = 0.5
 """Share of the price that texture must say against a motion for others to be looked for."""
 
@@ -84,6 +86,39 @@ def told_apart(
         # What has not been asked about may be as good as any.
         prices[:] = LEAST * price
         prices[list(said)] = np.clip(price + np.array(list(said.values())), LEAST * price, MOST * price)
+
+
+def vouched_for(
+    choices: Choices,
+    prices: dict[int, float],
+    agreeing: Callable[[int | None, Pair], int],
+    price: float,
+    parts: int | None,
+) -> dict[int, float]:
+    """Motions and their prices, with those that explain half a price at least and that texture vouches for.
+
+    Two drawers pulled out by nearly the same are one to points and colours, or nearly so; but texture goes along with
+    the motion of its own alone.
+
+    Args:
+        prices: the motions that there are for certain.
+        agreeing: how many patches of these points, (n,) bool of each state, go along with a motion; None is to stay.
+        price: of each motion, in points.
+        parts: choose no more than this many.
+    """
+    kept = frozenset(prices)
+    if parts is not None and len(kept) >= parts:
+        return prices
+    for k, gain in choices.gains(kept).items():
+        if gain < LEAST * price:
+            break
+        more = sorted(kept | {k})
+        first, second = choices.labels(more)
+        mine = first == more.index(k) + 1, second == more.index(k) + 1
+        own = agreeing(k, mine)
+        if own >= ENOUGH and max(agreeing(j, mine) for j in (None, *kept)) < OTHERWISE * own:
+            return vouched_for(choices, {**prices, k: LEAST * price}, agreeing, price, parts)
+    return prices
 
 
 @torch.no_grad()
@@ -178,7 +213,7 @@ def _adjusted(
     return theta, (a * b).mean(1) / (a.std(1) * b.std(1))
 
 
-def against(
+def compared(
     surfaces: tuple[Surface, Surface],
     photographs: Sequence[Sequence[Photograph]],
     T_1_0: np.ndarray,
@@ -186,16 +221,25 @@ def against(
     extent: float,
     config: TextureConfig,
     seed: int,
-) -> float:
-    """What texture says against a motion of the points owned, (n,) bool of each state, in points; below 0: for it."""
-    total, rng = 0.0, np.random.default_rng(seed)
+) -> list[tuple[np.ndarray, float]]:
+    """For each state, what ``carried`` says of some of the points owned, (n,) bool, and how many each stands for."""
+    found, rng = [], np.random.default_rng(seed)
     for s, T in enumerate((T_1_0, np.linalg.inv(T_1_0))):
         rows = rng.permutation(np.flatnonzero(owned[s]))
         some = surfaces[s].rows(rows[: config.patches])
-        if len(rows):
-            likeness = carried(some.points, some.normals, T, (photographs[s], photographs[1 - s]), extent)
-            total += COST * float((AGREED - likeness).sum()) * len(rows) / len(some.points)
-    return total
+        likeness = carried(some.points, some.normals, T, (photographs[s], photographs[1 - s]), extent)
+        found.append((likeness, len(rows) / max(len(some.points), 1)))
+    return found
+
+
+def against(found: Sequence[tuple[np.ndarray, float]]) -> float:
+    """What texture ``compared`` says against a motion, in points; below 0: for it."""
+    return sum(COST * float((AGREED - likeness).sum()) * points for likeness, points in found)
+
+
+def agreeing(found: Sequence[tuple[np.ndarray, float]]) -> int:
+    """How many of the patches ``compared`` go along with the motion."""
+    return sum(int((likeness > AGREED).sum()) for likeness, _ in found)
 
 
 def _outward(points: np.ndarray, normals: np.ndarray, photographs: Sequence[Photograph], near: float) -> np.ndarray:
@@ -210,4 +254,14 @@ def _outward(points: np.ndarray, normals: np.ndarray, photographs: Sequence[Phot
     return np.where(facing < 0, -1.0, 1.0)
 
 
-__all__ = ["TextureConfig", "against", "carried", "photographs_of", "told_apart"]
+__all__ = [
+    "TextureConfig",
+    "against",
+    "agreeing",
+    "carried",
+    "compared",
+    "fitted",
+    "photographs_of",
+    "told_apart",
+    "vouched_for",
+]
