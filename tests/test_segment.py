@@ -12,7 +12,7 @@ import pytest
 from hingesplat.gaussians import concatenate, posed
 from hingesplat.hypotheses import PATCH, HypothesesConfig, axis_directions, distinct, groups_to_try, registered
 from hingesplat.labelling import Choices, Labelling, gone, label_costs, neighbour_weights, seed_costs, shortest, softmax
-from hingesplat.pieces import give_way, reattach_fragments, seen_to_move, split_pieces
+from hingesplat.pieces import follow_fronts, give_way, reattach_fragments, seen_to_move, split_pieces
 from hingesplat.render import render
 from hingesplat.screw import prismatic, revolute
 from hingesplat.se3 import moved
@@ -480,21 +480,26 @@ def test_texture_buys_a_motion_of_its_own_at_half_the_price() -> None:
             those[:] = kept
             return np.arange(len(kept) + 1), np.arange(len(kept) + 1)
 
-    def chosen(goes_along: dict[tuple[int, int | None], int], parts: int | None = None) -> dict[int, float]:
-        """``goes_along``: patches of the points of one motion that go along with another, or with none."""
+    def chosen(
+        goes_along: dict[tuple[int, int | None], int], parts: int | None = None, *, near: bool = True
+    ) -> dict[int, float]:
+        """``goes_along``: of 20 patches of the points of one motion, those that go along with another, or with none."""
 
-        def agreeing(k: int | None, mine: tuple[np.ndarray, np.ndarray]) -> int:
+        def likeness(k: int | None, mine: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
             asked.add(k)
-            return goes_along.get((those[int(np.flatnonzero(mine[0])[0]) - 1], k), 0)
+            good = goes_along.get((those[int(np.flatnonzero(mine[0])[0]) - 1], k), 0)
+            return np.repeat([0.95, 0.2], [good, 20 - good]) if good != 4 else np.full(4, 0.95)
 
-        return vouched_for(cast(Choices, Drawers()), {0: 40.0}, agreeing, 40.0, parts)
+        return vouched_for(cast(Choices, Drawers()), {0: 40.0}, lambda *_: near, likeness, 40.0, parts)
 
     assert chosen({(1, 1): 16, (1, 0): 2}) == {0: 40, 1: 20}
     assert chosen({(1, 1): 16, (2, 2): 16}) == {0: 40, 1: 20, 2: 20}
     assert chosen({(1, 1): 16, (1, 0): 14}) == {0: 40}
     assert chosen({(1, 1): 16, (1, None): 14}) == {0: 40}
-    assert chosen({(1, 1): 4}) == {0: 40}
+    assert chosen({(1, 1): 8}) == {0: 40}  # Most go elsewhere.
+    assert chosen({(1, 1): 4}) == {0: 40}  # They are all there is.
     assert chosen({(1, 1): 16}, parts=1) == {0: 40}
+    assert chosen({(1, 1): 16}, near=False) == {0: 40}
     assert asked == {None, 0, 1, 2}
 
 
@@ -687,6 +692,20 @@ def test_what_another_motion_merely_hides_goes_to_the_part_that_it_touches(monke
     given = np.repeat([0, 1, 1, 2], [400, 225, 64, 225])
     for found in reattach_fragments([SHIFT.T, other.T], (given, given), surfaces, 1.0):
         np.testing.assert_array_equal(found, np.repeat([0, 1, label, 2], [400, 225, 64, 225]))
+
+
+@pytest.mark.parametrize(("thick", "label"), [(0.04, 2), (0.1, 1)])
+def test_the_back_of_a_plate_follows_its_front(monkeypatch, thick: float, label: int) -> None:
+    """Two doors one above the other: both motions take the inside of the second, thought to be the first's, out of
+    sight."""
+    monkeypatch.setattr("hingesplat.pieces.may_go", lambda surface, *_: np.ones(len(surface.points), bool))
+    first, second, back = (patch((0, 0, z), 15) for z in (0.5, -0.5, -0.5 - thick))
+    monkeypatch.setattr("hingesplat.pieces.hidden", lambda surface, *_: np.repeat([False, True], [850, 225]))
+    points = np.concatenate([BASE, first, second, back])
+    given = np.repeat([0, 1, 2, 1], [400, 225, 225, 225])
+    turn = replace(TURN, pivot=np.zeros(3))
+    for found in follow_fronts([turn.T, turn.T], (given, given), (plain(points), plain(points)), 1.0):
+        np.testing.assert_array_equal(found, np.repeat([0, 1, 2, label], [400, 225, 225, 225]))
 
 
 def test_what_is_left_without_points_in_one_state_is_no_part(monkeypatch) -> None:

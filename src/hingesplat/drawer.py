@@ -17,7 +17,7 @@ from hingesplat.se3 import moved
 from hingesplat.surface import Labels, Surface, components
 from hingesplat.tsdf import DistanceGrid
 
-SEEN = 0.2
+SEEN = 0.1
 """Share of what its walls enclose that must have been seen, for it to be hollow."""
 FULL = 0.6
 """Share of it that is solid in a block, a panel, or a drawer's front: these end where they end."""

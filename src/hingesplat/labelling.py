@@ -29,6 +29,8 @@ SAME, OTHER = 0.05, 0.5
 NOBODY = 0.3
 """What a point without a partner in the other state hears from it, between a partner that disagrees (0) and one that
 agrees (1)."""
+NEARLY = 0.3
+"""Cost of a point by which one explanation is no more than a little worse than another."""
 ADDED, EXCHANGED, PAIRED = 10, 6, 4
 """Motions that each round of a choice tries to add, to exchange for one that is there, and to combine in exchange."""
 
@@ -170,6 +172,17 @@ class Labelling:
     def labels(self, T_1_0: Sequence[np.ndarray]) -> Labels:
         """Labels of both states' points under these motions, all of which stay."""
         return self.mean_field(self.costs(T_1_0), self.partners(T_1_0))[0]
+
+    def alone(self, T_1_0: Sequence[np.ndarray]) -> np.ndarray:
+        """(motions,) share of each motion's points that neither another of them nor to stay explains nearly as well."""
+        costs = self.costs(T_1_0)
+        labels = self.mean_field(costs, self.partners(T_1_0))[0]
+        result = np.zeros(len(T_1_0))
+        for k in range(len(T_1_0)):
+            own = np.concatenate([c[label == k + 1] for c, label in zip(costs, labels, strict=True)])
+            worse = np.delete(own, k + 1, 1).min(1) - own[:, k + 1]
+            result[k] = (worse > NEARLY).mean() if len(own) else 0
+        return result
 
 
 class Choices:

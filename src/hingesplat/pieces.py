@@ -6,7 +6,7 @@ from itertools import permutations
 import numpy as np
 from scipy.spatial import KDTree
 
-from hingesplat.labelling import HIDDEN_COST, gone, label_costs, may_go
+from hingesplat.labelling import HIDDEN_COST, gone, hidden, label_costs, may_go
 from hingesplat.screw import matrix_to_screw
 from hingesplat.se3 import moved
 from hingesplat.search import Motion
@@ -25,6 +25,8 @@ LINKED = 0.25
 """Links across a hinge line that make one part of what lies on both sides, for every point that it is long."""
 GONE = 0.3
 """Share of a part's points that one of the states at least must show to have gone."""
+PLATE = 0.06
+"""Extents between the two sides of a plate at most."""
 UPON = 0.01
 """Extents between points that lie in the same place."""
 SURE = 0.4
@@ -163,6 +165,39 @@ def give_way(T_1_0: Sequence[np.ndarray], owned: Labels, surfaces: tuple[Surface
             gap = KDTree(firm).query(landed)[0]
             met = KDTree(own).query(landed)[0] if len(own) else np.inf
             labels[s][loose[(gap < UPON * extent) & (gap < met)]] = k + 1
+    return labels
+
+
+def follow_fronts(
+    T_1_0: Sequence[np.ndarray], owned: Labels, surfaces: tuple[Surface, Surface], extent: float
+) -> Labels:
+    """Labels in which the back of a plate is the part's whose front is right before it.
+
+    What two motions take out of sight may follow either: of two doors one above the other that open by nearly the same,
+    the inside of one was the other's. A piece of such points goes along with those that both states show of a part, if
+    they are no farther than a plate is thick and twice as close as those of its own.
+
+    Args:
+        T_1_0: (4, 4) motion of each part from state 0 to state 1.
+        owned: label of each point, 0 for the base.
+    """
+    labels = (owned[0].copy(), owned[1].copy())
+    for s, ways in enumerate((T_1_0, [np.linalg.inv(T) for T in T_1_0])):
+        points, other = surfaces[s].points, surfaces[1 - s].sight
+        lost = [hidden(surfaces[s], other, T) for T in ways]
+        firm = [
+            KDTree(points[(owned[s] == k + 1) & ~lost[k] & may_go(surfaces[s], other, T)]) for k, T in enumerate(ways)
+        ]
+        for j, k in permutations(range(len(T_1_0)), 2):
+            loose = np.flatnonzero((owned[s] == j + 1) & lost[j] & lost[k])
+            if not (firm[j].n and firm[k].n and len(loose)):
+                continue
+            own, front = (np.asarray(firm[i].query(points[loose])[0]) for i in (j, k))
+            piece = components(points[loose], 0.025 * extent)
+            for p in np.unique(piece):
+                gap = front[piece == p].mean()
+                if gap < min(PLATE * extent, own[piece == p].mean() / 2):
+                    labels[s][loose[piece == p]] = k + 1
     return labels
 
 

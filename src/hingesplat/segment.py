@@ -29,7 +29,7 @@ from hingesplat.hypotheses import (
     refit,
 )
 from hingesplat.labelling import Choices, Labelling, seed_costs
-from hingesplat.pieces import give_way, reattach_fragments, seen_to_move, split_pieces
+from hingesplat.pieces import follow_fronts, give_way, reattach_fragments, seen_to_move, split_pieces
 from hingesplat.se3 import moved
 from hingesplat.search import BASE, Motion, ScoreVolume, carrier_of, inverted, novelty, scan, score_volume
 from hingesplat.stereo import DepthMap
@@ -37,7 +37,6 @@ from hingesplat.surface import Pair, Surface, bounds, surface_of, thin
 from hingesplat.texture import (
     TextureConfig,
     against,
-    agreeing,
     compared,
     fitted,
     photographs_of,
@@ -47,8 +46,11 @@ from hingesplat.texture import (
 from hingesplat.training import evenly
 from hingesplat.visibility import FREE, HIDDEN, ask
 
+ALONE = 0.5
+"""Share of a hanging part's points that nothing else may explain nearly as well; else they are those of a door whose
+motion is a little off."""
 ALIKE = 0.06
-"""Extents between the places to which two motions take their parts, in the mean, for one to be tried for both."""
+"""Extents between the places to which two motions take points, in the mean, for them to be nearly the same."""
 
 
 @dataclass(frozen=True)
@@ -231,10 +233,16 @@ def segment(
             T_1_0 = BASE if k is None else ways[k]
             return compared(problem.surfaces, photographs, T_1_0, mine, extent, config.texture, seed)
 
+        def likeness(k: int | None, mine: Pair) -> np.ndarray:
+            return np.concatenate([found for found, _ in texture(k, mine)])
+
+        def nearly(j: int, k: int, mine: Pair) -> bool:
+            return alike(problem.surfaces[0].points[mine[0]], ways[j], ways[k], extent)
+
         ways = [m.T for m in chosen]
         choices = Choices(problem, ways)
         told = told_apart(choices, lambda *asked: against(texture(*asked)), config.part_cost, parts)
-        told = vouched_for(choices, told, lambda *asked: agreeing(texture(*asked)), config.part_cost, parts)
+        told = vouched_for(choices, told, nearly, likeness, config.part_cost, parts)
         chosen, prices = [chosen[k] for k in told], list(told.values())
     chosen = settled(chosen, prices)
     # What no joint on the base explains may hang on another part.
@@ -243,6 +251,8 @@ def segment(
     hanging = propose_hanging(evidence, stray, chosen, lambda motions: costs_of(motions)[left])
     if hanging:
         more = settled([*chosen, *hanging], [config.hanging_cost] * (len(chosen) + len(hanging)))
+        alone = problem.alone([motion.T for motion in more])
+        more = [m for m, share in zip(more, alone, strict=True) if carrier_of(m, more) is None or share > ALONE]
         if any(carrier_of(motion, more) is not None for motion in more):
             chosen = more
     if config.texture.patches and not any(carrier_of(m, chosen) is not None for m in chosen):
@@ -259,7 +269,7 @@ def segment(
         chosen, owned = pieces
     transforms = [m.T for m in chosen]
     owned = give_way(transforms, reattach_fragments(transforms, owned, surfaces, extent), surfaces, extent)
-    owned = insides(transforms, owned, surfaces, extent)
+    owned = insides(transforms, follow_fronts(transforms, owned, surfaces, extent), surfaces, extent)
     chosen, owned = seen_to_move(chosen, owned, surfaces, config.min_part_seeds)
     costs = costs_of(chosen) if chosen else np.ones((1, 1))
     unexplained = float((costs.min(1) >= config.explained_cost).mean())
@@ -278,10 +288,15 @@ def one_for_two(evidence: Evidence, motions: Sequence[Motion], owners: Sequence[
         larger, smaller = sorted(pair, key=lambda k: -sum(map(len, owners[k])))
         both = tuple(np.concatenate([owners[k][s] for k in pair]) for s in (0, 1))
         points = evidence.surfaces[0].points[both[0]]
-        ends = moved(points, motions[larger].T) - moved(points, motions[smaller].T)
-        if len(points) and np.linalg.norm(ends, axis=1).mean() < ALIKE * evidence.extent:
+        if alike(points, motions[larger].T, motions[smaller].T, evidence.extent):
             shared[larger, smaller] = refit(evidence, motions[larger], (both[0], both[1]))
     return shared
+
+
+def alike(points: np.ndarray, first: np.ndarray, second: np.ndarray, extent: float) -> bool:
+    """Whether two motions (4, 4) take points (n, 3) to nearly the same places."""
+    apart = np.linalg.norm(moved(points, first) - moved(points, second), axis=1)
+    return len(points) > 0 and float(apart.mean()) < ALIKE * extent
 
 
 def segment_states(

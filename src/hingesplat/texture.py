@@ -31,13 +31,13 @@ OFF = np.array([0.03, 0.03, 0.03, 0.008, 0.008, 0.008])
 AGREED = 0.6
 """Correlation that speaks neither for a motion nor against it."""
 ENOUGH, GOES_ALONG = 5, 0.85
-"""Patches, and the median of their correlations, that make a correction better than what it corrects."""
+"""Patches, and the median of their correlations, that make a motion theirs."""
 COST = 1.5
 """What a point that is short of it by 1 adds to a motion's description length."""
 LEAST, MOST = 0.5, 3.0
 """Shares of a motion's price to which texture may lower it, and raise it; what is not asked about yet has the first."""
 OTHERWISE = 0.3
-"""Share of the patches that go along with a motion of which fewer may go along with any other, for it to be theirs."""
+"""Share of the patches that go along with a motion, of which fewer may go along with any other."""
 DOUBT = 0.5
 """Share of the price that texture must say against a motion for others to be looked for."""
 
@@ -91,18 +91,20 @@ def told_apart(
 def vouched_for(
     choices: Choices,
     prices: dict[int, float],
-    agreeing: Callable[[int | None, Pair], int],
+    alike: Callable[[int, int, Pair], bool],
+    likeness: Callable[[int | None, Pair], np.ndarray],
     price: float,
     parts: int | None,
 ) -> dict[int, float]:
-    """Motions and their prices, with those that explain half a price at least and that texture vouches for.
+    """Motions and their prices, with those like one of them that explain half a price and that texture vouches for.
 
     Two drawers pulled out by nearly the same are one to points and colours, or nearly so; but texture goes along with
-    the motion of its own alone.
+    the motion of its own alone. Elsewhere it does not buy a motion: handles of a kind go along with look-alikes, too.
 
     Args:
         prices: the motions that there are for certain.
-        agreeing: how many patches of these points, (n,) bool of each state, go along with a motion; None is to stay.
+        alike: whether two motions take these points, (n,) bool of each state, to nearly the same places.
+        likeness: correlations (m,) of patches of such points, moved so; None is to stay.
         price: of each motion, in points.
         parts: choose no more than this many.
     """
@@ -115,10 +117,16 @@ def vouched_for(
         more = sorted(kept | {k})
         first, second = choices.labels(more)
         mine = first == more.index(k) + 1, second == more.index(k) + 1
-        own = agreeing(k, mine)
-        if own >= ENOUGH and max(agreeing(j, mine) for j in (None, *kept)) < OTHERWISE * own:
-            return vouched_for(choices, {**prices, k: LEAST * price}, agreeing, price, parts)
+        if not any(alike(j, k, mine) for j in kept) or not _goes_along(own := likeness(k, mine)):
+            continue
+        if all((likeness(j, mine) > AGREED).sum() < OTHERWISE * len(own) for j in (None, *kept)):
+            return vouched_for(choices, {**prices, k: LEAST * price}, alike, likeness, price, parts)
     return prices
+
+
+def _goes_along(likeness: np.ndarray) -> bool:
+    """Whether correlations (m,) say that this is the motion."""
+    return len(likeness) >= ENOUGH and float(np.median(likeness)) > GOES_ALONG
 
 
 @torch.no_grad()
@@ -174,7 +182,7 @@ def fitted(motion: Motion, surface: Surface, photographs: Sequence[Sequence[Phot
 
     spread = np.array([0.05, 0.05, 0.02, 0.02, 0.05 if turns else 0.02])
     theta, likeness = _adjusted(surface.points, surface.normals, place, spread, photographs, extent)
-    return joint(theta) if len(likeness) >= ENOUGH and np.median(likeness) > GOES_ALONG else motion
+    return joint(theta) if _goes_along(likeness) else motion
 
 
 def _adjusted(
@@ -237,11 +245,6 @@ def against(found: Sequence[tuple[np.ndarray, float]]) -> float:
     return sum(COST * float((AGREED - likeness).sum()) * points for likeness, points in found)
 
 
-def agreeing(found: Sequence[tuple[np.ndarray, float]]) -> int:
-    """How many of the patches ``compared`` go along with the motion."""
-    return sum(int((likeness > AGREED).sum()) for likeness, _ in found)
-
-
 def _outward(points: np.ndarray, normals: np.ndarray, photographs: Sequence[Photograph], near: float) -> np.ndarray:
     """(n,) the sign with which normals (n, 3) face the cameras that see the points (n, 3)."""
     facing = np.zeros(len(points))
@@ -257,7 +260,6 @@ def _outward(points: np.ndarray, normals: np.ndarray, photographs: Sequence[Phot
 __all__ = [
     "TextureConfig",
     "against",
-    "agreeing",
     "carried",
     "compared",
     "fitted",
