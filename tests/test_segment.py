@@ -504,6 +504,17 @@ def test_texture_buys_a_motion_of_its_own_at_half_the_price() -> None:
 
 
 @pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+def test_a_motion_is_alone_where_no_other_is_nearly_as_good(kind: Literal["revolute", "prismatic"]) -> None:
+    made = made_scene(kind)
+    low, high, surfaces = survey((made.gaussians, made.at(1)), made.views, ((), ()), CONFIG)
+    extent = float((high - low).max())
+    problem, right = Labelling.of(surfaces, extent), TURN if kind == "revolute" else PULL
+    nearly = replace(right, value=right.value + 0.01)
+    assert problem.alone([right.T])[0] > 0.7
+    assert (problem.alone([right.T, nearly.T]) < 0.3).all()
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
 def test_what_a_motion_gains_is_what_it_takes_off_the_energy(kind: Literal["revolute", "prismatic"]) -> None:
     made = made_scene(kind)
     low, high, surfaces = survey((made.gaussians, made.at(1)), made.views, ((), ()), CONFIG)
