@@ -22,11 +22,10 @@ from hingesplat.segment import (
     floating,
     one_for_two,
     segment,
-    segment_states,
     spread_labels,
     survey,
-    track,
 )
+from hingesplat.states import segment_states, track
 from hingesplat.stereo import Cloud, DepthMap, StereoConfig, depth_map, stereo
 from hingesplat.surface import Labels, Surface, bounds, components, surface_of, thin
 from hingesplat.texture import told_apart, vouched_for
@@ -867,7 +866,7 @@ def test_states_between_are_not_searched_again_where_all_is_known(monkeypatch) -
     views = [made.views[0], tuple(photograph(half, v.camera) for v in made.views[0]), made.views[1]]
     searched = []
     monkeypatch.setattr(
-        "hingesplat.segment.segment", lambda pair, *a, **k: searched.append(pair) or segment(pair, *a, **k)
+        "hingesplat.states.segment", lambda pair, *a, **k: searched.append(pair) or segment(pair, *a, **k)
     )
     found, other, T_state_0 = segment_states([made.gaussians, half, made.at(1)], views, QUICK)
     assert len(searched) == 1 and other == 2 and len(found.motions) == 1

@@ -50,9 +50,10 @@ from hingesplat.run_folder import (
     versions,
     write_tensors,
 )
-from hingesplat.segment import Segmentation, SegmentConfig, segment_states
+from hingesplat.segment import Segmentation, SegmentConfig
 from hingesplat.slots import living_slots
 from hingesplat.start import StartConfig, clusters, random_motions
+from hingesplat.states import segment_states
 from hingesplat.stereo import DepthMap, StereoConfig, depth_map, measured, stereo
 from hingesplat.training import Report
 from hingesplat.twin import Joint, Part, Twin

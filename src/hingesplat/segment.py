@@ -8,9 +8,8 @@ nearest point.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -23,17 +22,17 @@ from hingesplat.hypotheses import (
     HypothesesConfig,
     consensus,
     distinct,
-    polished,
     propose,
     propose_hanging,
     refit,
 )
 from hingesplat.labelling import Choices, Labelling, seed_costs
+from hingesplat.patches import Photograph
 from hingesplat.pieces import follow_fronts, give_way, reattach_fragments, seen_to_move, split_pieces
 from hingesplat.se3 import moved
-from hingesplat.search import BASE, Motion, ScoreVolume, carrier_of, inverted, novelty, scan, score_volume
+from hingesplat.search import BASE, Motion, ScoreVolume, carrier_of, inverted, novelty, score_volume
 from hingesplat.stereo import DepthMap
-from hingesplat.surface import Pair, Surface, bounds, surface_of, thin
+from hingesplat.surface import Labels, Pair, Surface, bounds, surface_of, thin
 from hingesplat.texture import (
     TextureConfig,
     against,
@@ -179,102 +178,159 @@ def segment(
         maps: the depth of these photographs where it is known.
         parts: number of movable parts at most, or None to find it.
     """
-    rng = np.random.default_rng(seed)
     low, high, surfaces = survey(gaussians, views, maps, config)
-    evidence, seeds = gather(surfaces, low, high, config, rng)
-    extent = evidence.extent
-    pool = propose(evidence, seeds)
-    n_seeds = sum(len(i) for i in seeds)
-    if not pool:
+    evidence, seeds = gather(surfaces, low, high, config, np.random.default_rng(seed))
+    judges = (seeds[0][: config.max_seeds], seeds[1][: config.max_seeds])
+    n_seeds = sum(map(len, seeds))
+    candidates = _candidates(evidence, seeds, judges)
+    if not candidates:
         empty = (np.zeros(len(gaussians[0]), int), np.zeros(len(gaussians[1]), int))
         return Segmentation(empty, (), 0.0, n_seeds)
 
-    judging = [index[: config.max_seeds] for index in seeds]
-    judges = [s.rows(index) for s, index in zip(surfaces, judging, strict=True)]
-
-    def costs_of(candidates: Sequence[Motion]) -> np.ndarray:
-        """(seeds, candidates) what the other state's cameras say of every seed under every candidate."""
-        forward, backward = [m.T for m in candidates], [inverted(m).T for m in candidates]
-        return np.concatenate(
-            [
-                seed_costs(judges[0], surfaces[1].sight, forward, extent),
-                seed_costs(judges[1], surfaces[0].sight, backward, extent),
-            ]
-        )
-
-    costs = costs_of(pool)
-    pool += consensus(evidence, judging, pool, costs)
-    costs = np.concatenate([costs, costs_of(pool[costs.shape[1] :])], 1)
-    sample = np.concatenate([j.points[:100] for j in judges])
-    chosen = [pool[k] for k in distinct(pool, costs, sample, 0.012 * extent, config.hypotheses.candidates)]
-
-    rows = [thin(surface.points, 2 * config.spacing * extent, rng) for surface in surfaces]
-    problem = Labelling.of((surfaces[0].rows(rows[0]), surfaces[1].rows(rows[1])), extent)
-
-    def settled(candidates: list[Motion], prices: list[float]) -> list[Motion]:
-        """Those of the candidates that there are, refined on what they own."""
-        owners: list[Pair] = []
-        for _ in range(config.rounds):
-            shared = one_for_two(evidence, candidates, owners)
-            candidates, prices = candidates + list(shared.values()), prices + [prices[k] for k, _ in shared]
-            choices = Choices(problem, [m.T for m in candidates])
-            kept = sorted(choices.best(np.array(prices), parts))
-            owned = choices.labels(kept)
-            owners = [(rows[0][owned[0] == i + 1], rows[1][owned[1] == i + 1]) for i in range(len(kept))]
-            candidates = [refit(evidence, candidates[k], own) for k, own in zip(kept, owners, strict=True)]
-            prices = [prices[k] for k in kept]
-        return candidates
-
-    prices = [config.part_cost] * len(chosen)
+    case = _Case.of(evidence, judges, config, parts)
+    prices = dict.fromkeys(range(len(candidates)), config.part_cost)
+    photographs = []
     if config.texture.patches:
         photographs = [photographs_of(g, v, config.texture) for g, v in zip(gaussians, views, strict=True)]
+        prices = case.told_by_texture([m.T for m in candidates], photographs, seed)
+    chosen = case.settled([candidates[k] for k in prices], list(prices.values()))
+    chosen = case.with_hanging(chosen)
+    if photographs and not any(carrier_of(m, chosen) is not None for m in chosen):
+        chosen = case.corrected(chosen, photographs)
+
+    chosen, owned = _labelled(chosen, surfaces, evidence.extent, config, parts)
+    costs = _seed_costs(evidence, judges, chosen) if chosen else np.ones((1, 1))
+    unexplained = float((costs.min(1) >= config.explained_cost).mean())
+    labels = tuple(spread_labels(gaussians[s].means.numpy(), surfaces[s], owned[s]) for s in (0, 1))
+    return Segmentation((labels[0], labels[1]), tuple(chosen), unexplained, n_seeds)
+
+
+def _seed_costs(evidence: Evidence, seeds: Pair, motions: Sequence[Motion]) -> np.ndarray:
+    """(seeds, motions) what the other state's cameras say of seeds, rows of each state's points, under every motion."""
+    ways = [m.T for m in motions], [inverted(m).T for m in motions]
+    first, second = (
+        seed_costs(evidence.surfaces[s].rows(seeds[s]), evidence.surfaces[1 - s].sight, ways[s], evidence.extent)
+        for s in (0, 1)
+    )
+    return np.concatenate([first, second])
+
+
+def _candidates(evidence: Evidence, seeds: Sequence[np.ndarray], judges: Pair) -> list[Motion]:
+    """Motions that may be those of the parts, no two of them alike; none where nothing moved.
+
+    ``seeds`` and ``judges``, some of them, are rows of each state's points.
+    """
+    pool = propose(evidence, seeds)
+    if not pool:
+        return []
+    costs = _seed_costs(evidence, judges, pool)
+    refined = consensus(evidence, judges, pool, costs)
+    costs = np.concatenate([costs, _seed_costs(evidence, judges, refined)], 1)
+    pool += refined
+    sample = np.concatenate([evidence.surfaces[s].points[judges[s][:100]] for s in (0, 1)])
+    apart, limit = 0.012 * evidence.extent, evidence.config.candidates
+    return [pool[k] for k in distinct(pool, costs, sample, apart, limit)]
+
+
+@dataclass(frozen=True)
+class _Case:
+    """What decides which motions there are."""
+
+    evidence: Evidence
+    seeds: Pair
+    """Rows of each state's points that must have moved."""
+    rows: Pair
+    """Rows of each state's points that are labelled."""
+    problem: Labelling
+    """Of these."""
+    config: SegmentConfig
+    parts: int | None
+    """No more than this many motions."""
+
+    @staticmethod
+    def of(evidence: Evidence, seeds: Pair, config: SegmentConfig, parts: int | None) -> "_Case":
+        first, second = evidence.surfaces
+        rows = tuple(thin(s.points, 2 * config.spacing * evidence.extent, evidence.rng) for s in (first, second))
+        problem = Labelling.of((first.rows(rows[0]), second.rows(rows[1])), evidence.extent)
+        return _Case(evidence, seeds, (rows[0], rows[1]), problem, config, parts)
+
+    def told_by_texture(
+        self, ways: Sequence[np.ndarray], photographs: Sequence[Sequence[Photograph]], seed: int
+    ) -> dict[int, float]:
+        """Which of the motions (4, 4) there are, and their prices: look-alikes told apart, and what is nearly alike."""
+        surfaces, extent, price = self.problem.surfaces, self.evidence.extent, self.config.part_cost
 
         def texture(k: int | None, mine: Pair) -> list[tuple[np.ndarray, float]]:
             T_1_0 = BASE if k is None else ways[k]
-            return compared(problem.surfaces, photographs, T_1_0, mine, extent, config.texture, seed)
+            return compared(surfaces, photographs, T_1_0, mine, extent, self.config.texture, seed)
 
         def likeness(k: int | None, mine: Pair) -> np.ndarray:
             return np.concatenate([found for found, _ in texture(k, mine)])
 
         def nearly(j: int, k: int, mine: Pair) -> bool:
-            return alike(problem.surfaces[0].points[mine[0]], ways[j], ways[k], extent)
+            return alike(surfaces[0].points[mine[0]], ways[j], ways[k], extent)
 
-        ways = [m.T for m in chosen]
-        choices = Choices(problem, ways)
-        told = told_apart(choices, lambda *asked: against(texture(*asked)), config.part_cost, parts)
-        told = vouched_for(choices, told, nearly, likeness, config.part_cost, parts)
-        chosen, prices = [chosen[k] for k in told], list(told.values())
-    chosen = settled(chosen, prices)
-    # What no joint on the base explains may hang on another part.
-    left = np.flatnonzero(costs_of(chosen).min(1) >= config.explained_cost) if chosen else np.zeros(0, int)
-    stray = [judging[0][left[left < len(judging[0])]], judging[1][left[left >= len(judging[0])] - len(judging[0])]]
-    hanging = propose_hanging(evidence, stray, chosen, lambda motions: costs_of(motions)[left])
-    if hanging:
-        more = settled([*chosen, *hanging], [config.hanging_cost] * (len(chosen) + len(hanging)))
-        alone = problem.alone([motion.T for motion in more])
+        choices = Choices(self.problem, ways)
+        told = told_apart(choices, lambda *asked: against(texture(*asked)), price, self.parts)
+        return vouched_for(choices, told, nearly, likeness, price, self.parts)
+
+    def settled(self, candidates: list[Motion], prices: list[float]) -> list[Motion]:
+        """Those of the candidates that there are, refined on what they own."""
+        owners: list[Pair] = []
+        for _ in range(self.config.rounds):
+            shared = one_for_two(self.evidence, candidates, owners)
+            candidates, prices = candidates + list(shared.values()), prices + [prices[k] for k, _ in shared]
+            choices = Choices(self.problem, [m.T for m in candidates])
+            kept = sorted(choices.best(np.array(prices), self.parts))
+            owned = choices.labels(kept)
+            owners = [(self.rows[0][owned[0] == i + 1], self.rows[1][owned[1] == i + 1]) for i in range(len(kept))]
+            candidates = [refit(self.evidence, candidates[k], own) for k, own in zip(kept, owners, strict=True)]
+            prices = [prices[k] for k in kept]
+        return candidates
+
+    def with_hanging(self, chosen: list[Motion]) -> list[Motion]:
+        """The motions, with those of parts that hang on theirs if what no joint on the base explains says so."""
+        if not chosen:
+            return chosen
+        left = _seed_costs(self.evidence, self.seeds, chosen).min(1) >= self.config.explained_cost
+        first, second = np.split(left, [len(self.seeds[0])])
+        stray = (self.seeds[0][first], self.seeds[1][second])
+        hanging = propose_hanging(
+            self.evidence, stray, chosen, lambda motions: _seed_costs(self.evidence, stray, motions)
+        )
+        if not hanging:
+            return chosen
+        more = self.settled([*chosen, *hanging], [self.config.hanging_cost] * (len(chosen) + len(hanging)))
+        alone = self.problem.alone([motion.T for motion in more])
         more = [m for m, share in zip(more, alone, strict=True) if carrier_of(m, more) is None or share > ALONE]
-        if any(carrier_of(motion, more) is not None for motion in more):
-            chosen = more
-    if config.texture.patches and not any(carrier_of(m, chosen) is not None for m in chosen):
-        here, label = problem.surfaces[0], problem.labels([m.T for m in chosen])[0]
-        mine = [rng.permutation(np.flatnonzero(label == k + 1)) for k in range(len(chosen))]
-        chosen = [
-            fitted(m, here.rows(own[: config.texture.corrected]), photographs, extent)
+        return more if any(carrier_of(motion, more) is not None for motion in more) else chosen
+
+    def corrected(self, chosen: Sequence[Motion], photographs: Sequence[Sequence[Photograph]]) -> list[Motion]:
+        """The motions, each corrected by the texture of what it owns in state 0."""
+        here, label = self.problem.surfaces[0], self.problem.labels([m.T for m in chosen])[0]
+        mine = [self.evidence.rng.permutation(np.flatnonzero(label == k + 1)) for k in range(len(chosen))]
+        return [
+            fitted(m, here.rows(own[: self.config.texture.corrected]), photographs, self.evidence.extent)
             for m, own in zip(chosen, mine, strict=True)
         ]
-    problem = Labelling.of(surfaces, extent)
-    owned = problem.labels([m.T for m in chosen])
-    pieces = split_pieces(chosen, owned, surfaces, extent, config.min_part_seeds)
+
+
+def _labelled(
+    motions: list[Motion],
+    surfaces: tuple[Surface, Surface],
+    extent: float,
+    config: SegmentConfig,
+    parts: int | None,
+) -> tuple[list[Motion], Labels]:
+    """The parts that these motions make, each one piece, and labels of all points of both states."""
+    owned = Labelling.of(surfaces, extent).labels([m.T for m in motions])
+    pieces = split_pieces(motions, owned, surfaces, extent, config.min_part_seeds)
     if parts is None or len(pieces[0]) <= parts:
-        chosen, owned = pieces
-    transforms = [m.T for m in chosen]
-    owned = give_way(transforms, reattach_fragments(transforms, owned, surfaces, extent), surfaces, extent)
-    owned = insides(transforms, follow_fronts(transforms, owned, surfaces, extent), surfaces, extent)
-    chosen, owned = seen_to_move(chosen, owned, surfaces, config.min_part_seeds)
-    costs = costs_of(chosen) if chosen else np.ones((1, 1))
-    unexplained = float((costs.min(1) >= config.explained_cost).mean())
-    labels = tuple(spread_labels(gaussians[s].means.numpy(), surfaces[s], owned[s]) for s in (0, 1))
-    return Segmentation((labels[0], labels[1]), tuple(chosen), unexplained, n_seeds)
+        motions, owned = pieces
+    transforms = [m.T for m in motions]
+    for mended in (reattach_fragments, give_way, follow_fronts, insides):
+        owned = mended(transforms, owned, surfaces, extent)
+    return seen_to_move(motions, owned, surfaces, config.min_part_seeds)
 
 
 def one_for_two(evidence: Evidence, motions: Sequence[Motion], owners: Sequence[Pair]) -> dict[tuple[int, int], Motion]:
@@ -299,161 +355,9 @@ def alike(points: np.ndarray, first: np.ndarray, second: np.ndarray, extent: flo
     return len(points) > 0 and float(apart.mean()) < ALIKE * extent
 
 
-def segment_states(
-    gaussians: Sequence[Gaussians],
-    views: Sequence[Sequence[View]],
-    config: SegmentConfig,
-    *,
-    maps: Sequence[Sequence[DepthMap]] = (),
-    parts: int | None = None,
-    seed: int = 0,
-) -> tuple[Segmentation, int, np.ndarray]:
-    """Parts of an object in two or more states, wherever they move.
-
-    The state in which most has moved since state 0 comes first. Then each of the others is searched, if more moves in
-    it than the parts known so far explain: a part may rest in all states but one.
-
-    Args:
-        gaussians: fitted to every state.
-        views: the training photographs of every state.
-        maps: the depth of these photographs where it is known.
-        parts: number of movable parts at most, or None to find it.
-
-    Returns:
-        The parts, with labels of state 0 and of that other state; the number of that state; and where each part is in
-        every state, T_state_0 (states, 1 + parts, 4, 4), the base first.
-    """
-    maps = maps or [()] * len(views)
-
-    def beside(t: int) -> tuple[tuple[Gaussians, Gaussians], tuple[Sequence[View], Sequence[View]]]:
-        return (gaussians[0], gaussians[t]), (views[0], views[t])
-
-    def more(t: int) -> dict[str, Any]:
-        return {"maps": (maps[0], maps[t]), "seed": seed}
-
-    others, moving = list(range(1, len(gaussians))), {}
-    if len(others) > 1:
-        moving = {t: _moving(*beside(t), config, **more(t)) for t in others}
-        others.sort(key=lambda t: -sum(map(len, moving[t][1])))
-    most = others[0]
-    found = segment(*beside(most), config, parts=parts, **more(most))
-    place = {(most, k): motion.T for k, motion in enumerate(found.motions)}
-    for t in others[1:]:
-        known = track(*beside(t), found.labels[0], found.motions, config, **more(t))
-        place |= {(t, k): T for k, T in enumerate(known)}
-        room = None if parts is None else parts - len(found.motions)
-        if room == 0 or _left_over(gaussians[0], found.labels[0], known, moving[t]) < config.min_left_over:
-            continue
-        here = segment(*beside(t), config, **more(t))
-        for k, motion in enumerate(here.motions[:room]):
-            mine = here.labels[0] == k + 1
-            new = mine & (found.labels[0] == 0)
-            if 2 * new.sum() > mine.sum():
-                place[t, len(found.motions)] = motion.T
-                found = _with_part(found, motion, new, (gaussians[0], gaussians[most]))
-    T_state_0 = np.tile(np.eye(4), (len(gaussians), 1 + len(found.motions), 1, 1))
-    for t in others:
-        if any((t, k) not in place for k in range(len(found.motions))):
-            late = track(*beside(t), found.labels[0], found.motions, config, **more(t))
-            place = {(t, k): T for k, T in enumerate(late)} | place
-        for k in range(len(found.motions)):
-            T_state_0[t, 1 + k] = place[t, k]
-    return found, most, T_state_0
-
-
-def _moving(
-    gaussians: tuple[Gaussians, Gaussians],
-    views: tuple[Sequence[View], Sequence[View]],
-    config: SegmentConfig,
-    *,
-    maps: tuple[Sequence[DepthMap], Sequence[DepthMap]],
-    seed: int,
-) -> tuple[float, list[np.ndarray]]:
-    """The extent of two states, and each state's points (n, 3), thinned, that must have moved."""
-    rng = np.random.default_rng(seed)
-    low, high, surfaces = survey(gaussians, views, maps, config)
-    extent = float((high - low).max())
-    rows = must_have_moved(surfaces, extent, rng)[0]
-    return extent, [surface.points[index] for surface, index in zip(surfaces, rows, strict=True)]
-
-
-def _left_over(
-    gaussians: Gaussians, labels: np.ndarray, T_t_0: Sequence[np.ndarray], moving: tuple[float, list[np.ndarray]]
-) -> int:
-    """How many of the points that must have moved belong to none of the parts known, in either state."""
-    extent, (here, there) = moving
-    means = gaussians.means.numpy()
-    at_end = np.concatenate([means[:0], *(moved(means[labels == k], T) for k, T in enumerate(T_t_0, 1))])
-    count = int((labels[KDTree(means).query(here)[1]] == 0).sum()) if len(here) else 0
-    if len(at_end) == 0 or len(there) == 0:
-        return count + len(there)
-    return count + int((KDTree(at_end).query(there)[0] > 0.03 * extent).sum())
-
-
-def _with_part(
-    found: Segmentation, motion: Motion, rows: np.ndarray, gaussians: tuple[Gaussians, Gaussians]
-) -> Segmentation:
-    """One part more, that of ``rows`` (n,) bool of state 0's Gaussians; in the other state of ``found`` it rests."""
-    here, there = (g.means.numpy() for g in gaussians)
-    part, labels = len(found.motions) + 1, (found.labels[0].copy(), found.labels[1].copy())
-    labels[0][rows] = part
-    labels[1][(labels[1] == 0) & rows[KDTree(here).query(there)[1]]] = part
-    return replace(found, labels=labels, motions=(*found.motions, motion))
-
-
-def track(
-    gaussians: tuple[Gaussians, Gaussians],
-    views: tuple[Sequence[View], Sequence[View]],
-    labels: np.ndarray,
-    motions: Sequence[Motion],
-    config: SegmentConfig,
-    *,
-    maps: tuple[Sequence[DepthMap], Sequence[DepthMap]] = ((), ()),
-    seed: int = 0,
-) -> list[np.ndarray]:
-    """T_t_0 (4×4) of every part in a further state, its joint known from another pair of states.
-
-    Args:
-        gaussians: fitted to state 0 and to the further state t.
-        views: the training photographs of the same two states.
-        labels: part id of every Gaussian of state 0.
-        motions: each part's joint, as ``segment`` found it.
-    """
-    rng = np.random.default_rng(seed)
-    low, high, (here, there) = survey(gaussians, views, maps, config)
-    extent = float((high - low).max())
-    volume = score_volume(there.points, there.colours, there.sight, here.sight, low, high, 2 * config.cells)
-    own_label = labels[KDTree(gaussians[0].means.numpy()).query(here.points)[1]]
-    carriers = [carrier_of(motion, motions) for motion in motions]
-    found: dict[int, np.ndarray] = {}
-    for k in sorted(range(len(motions)), key=lambda k: carriers[k] is not None):
-        motion, carrier = motions[k], carriers[k]
-        after = BASE if carrier is None else found[carrier]
-        own = np.flatnonzero(own_label == k + 1)
-        if len(own) < config.min_part_seeds:
-            found[k] = after
-            continue
-        motion = replace(motion, value=0.0, after=after)
-        mine = here.rows(rng.choice(own, min(2 * config.hypotheses.seeds_per_search, len(own)), replace=False))
-        reach = np.radians(150) if motion.kind == "revolute" else extent / 2
-        trials = scan(
-            motion.kind,
-            mine.points,
-            mine.colours,
-            motion.axis[None],
-            volume,
-            values=np.linspace(-reach, reach, 201),
-            near=motion,
-            after=after,
-            keep=6,
-        )
-        found[k] = polished([motion, *trials], mine, there, extent).T
-    return [found[k] for k in range(len(motions))]
-
-
 def spread_labels(points: np.ndarray, surface: Surface, labels: np.ndarray) -> np.ndarray:
     """(n,) labels for all Gaussians at points (n, 3): each takes its nearest surface point's."""
     return labels[KDTree(surface.points).query(points)[1]]
 
 
-__all__ = ["SegmentConfig", "Segmentation", "segment", "segment_states", "track"]
+__all__ = ["SegmentConfig", "Segmentation", "segment"]
