@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hingesplat.gaussians import concatenate, posed
-from hingesplat.hypotheses import PATCH, HypothesesConfig, axis_directions, distinct, groups_to_try, registered
+from hingesplat.hypotheses import PATCH, HypothesesConfig, axis_directions, distinct, edges, groups_to_try, registered
 from hingesplat.labelling import Choices, Labelling, gone, label_costs, neighbour_weights, seed_costs, shortest, softmax
 from hingesplat.pieces import follow_fronts, give_way, reattach_fragments, seen_to_move, split_pieces
 from hingesplat.render import render
@@ -524,6 +524,21 @@ def test_what_a_motion_gains_is_what_it_takes_off_the_energy(kind: Literal["revo
     # Dearer than what it gains it is not worth having, cheaper it is.
     for share, best in ((0.9, {1}), (1.1, set())):
         assert choices.best(np.array([1e6, share * gains[1]]), None) == best
+
+
+@pytest.mark.parametrize("height", [0.2, 0.4])
+def test_edges_are_those_of_the_plate(rng: np.random.Generator, height: float) -> None:
+    """A square one's, too, whose principal axes are any."""
+    R = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    flat = rng.uniform(-0.5, 0.5, (2000, 3)) * (0.4, height, 0.01)
+    found = edges(flat @ R.T + 1)
+    assert len(found) == 4 and all(m.kind == "revolute" and m.value == 0 for m in found)
+    sides = [(np.abs(m.axis @ R), (m.pivot - 1) @ R) for m in found]
+    for axis, middle in ((0, (0, height / 2, 0)), (0, (0, -height / 2, 0)), (1, (0.2, 0, 0)), (1, (-0.2, 0, 0))):
+        off = [np.linalg.norm(place - middle) for along, place in sides if along[axis] > 0.999]
+        assert len(off) == 2 and min(off) < 0.015
+    thick = rng.uniform(-0.5, 0.5, (2000, 3)) * (0.4, height, 0.2)
+    assert edges(thick @ R.T) == []
 
 
 def test_registered_keeps_the_kind_and_the_sign(turned: Turned) -> None:

@@ -16,6 +16,8 @@ from hingesplat.search import BASE, Motion, ScoreVolume, inverted, scan
 from hingesplat.stereo import Cloud
 from hingesplat.surface import Surface, components
 
+PLATE = 0.2
+"""Thickness of a plate, beside its sides."""
 PATCH = 60
 """Seeds of a large piece for each patch that may be a part of its own."""
 HANGING = 0.02
@@ -87,6 +89,32 @@ def axis_directions(groups: Sequence[np.ndarray]) -> np.ndarray:
     return np.array(kept[:12])
 
 
+def edges(points: np.ndarray) -> list[Motion]:
+    """Joints of no turn yet about the four edges of a plate, (n, 3) points of it; none of what is no plate.
+
+    The edges are those of the smallest rectangle that holds all but a few of the points.
+    """
+    middle = points.mean(0)
+    principal = np.linalg.svd(points - middle, full_matrices=False)[2]
+    flat, across = (points - middle) @ principal[:2].T, (points - middle) @ principal[2]
+
+    def rectangle(angle: float) -> tuple[np.ndarray, np.ndarray]:
+        """Directions (2, 2) of its sides, and its lower and upper corner (2, 2) along these."""
+        sides = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        return sides, np.quantile(flat @ sides.T, [0.01, 0.99], axis=0)
+
+    sides, corners = min(map(rectangle, np.radians(np.arange(0, 90, 2))), key=lambda r: float(np.ptp(r[1], 0).prod()))
+    if np.ptp(np.quantile(across, [0.1, 0.9])) > PLATE * np.sqrt(np.ptp(corners, 0).prod()):
+        return []
+    along, centre = sides @ principal[:2], corners.mean(0)
+    found = []
+    for a in (0, 1):
+        for end in corners[:, a]:
+            place = middle + end * along[a] + centre[1 - a] * along[1 - a]
+            found.append(Motion("revolute", along[1 - a], place, 0.0, 0.0))
+    return found
+
+
 def propose(evidence: Evidence, seeds: Sequence[np.ndarray], after: np.ndarray = BASE) -> list[Motion]:
     """Hypotheses, as motions from state 0 to 1, from every group of seeds (rows of both states' surfaces).
 
@@ -104,17 +132,25 @@ def propose(evidence: Evidence, seeds: Sequence[np.ndarray], after: np.ndarray =
     for s, group in groups:
         chosen = e.rng.choice(group, min(e.config.seeds_per_search, len(group)), replace=False)
         p, c = surfaces[s].points[chosen], surfaces[s].colours[chosen]
+        blurred, then = e.blurred[s][chosen], after if s == 0 else np.linalg.inv(after)
+
+        def add(motion: Motion, s: int = s, chosen: np.ndarray = chosen) -> None:
+            motion = polished([motion], surfaces[s].rows(chosen), e.fresh[1 - s], e.extent)
+            pool.append(motion if s == 0 else inverted(motion))
+
+        # Of a door that shows its inside in one state and its outside in the other little meets: an edge is its hinge.
+        for edge in edges(surfaces[s].points[group]) if len(group) >= PATCH else []:
+            for motion in scan("revolute", p, blurred, edge.axis[None], e.coarse[1 - s], near=edge, after=then, keep=1):
+                add(motion)
         # Slides get a hearing of their own: with three numbers fewer they are seldom the luckiest fit.
         for kind in ("revolute", "prismatic"):
-            then = after if s == 0 else np.linalg.inv(after)
-            found = scan(kind, p, e.blurred[s][chosen], directions, e.coarse[1 - s], after=then, keep=4)
+            found = scan(kind, p, blurred, directions, e.coarse[1 - s], after=then, keep=4)
             for motion in found:
                 if motion.score > max(0.1, 0.7 * found[0].score):
                     # Compare hypotheses at their best: on the grid a true one may be 3° off and lose to a lucky one.
                     for spread in (4.0, 1.5):
                         motion = refine_motion(motion, p, c, e.fine[1 - s], spread)
-                    motion = polished([motion], surfaces[s].rows(chosen), e.fresh[1 - s], e.extent)
-                    pool.append(motion if s == 0 else inverted(motion))
+                    add(motion)
     return pool
 
 
