@@ -186,6 +186,30 @@ def test_numba_drops_what_is_not_finite():
     assert all(g.isfinite().all() for g in gradients)
 
 
+@pytest.mark.parametrize("odd", ["no number", "behind the camera", "all one depth", "too near"])
+def test_slices_of_depth_are_right_whatever_the_depths(odd):
+    """Threads fill the lists of the tiles slice by slice; what tells where to cut may be nonsense."""
+    tensors, view = scene(4096), camera(100, 80)
+    centre = torch.from_numpy(view.centre).float()
+    forward = torch.from_numpy(view.T_world_camera[:3, 2]).float()
+    depth = (tensors[0] - centre) @ forward
+    if odd == "no number":
+        tensors[0][::64] = torch.nan  # Just those that are looked at.
+    elif odd == "behind the camera":
+        tensors[0][: 4000 // 2] -= 10 * depth[: 4000 // 2, None] * forward
+    else:
+        tensors[0] += ((1 if odd == "all one depth" else -1) - depth)[:, None] * forward
+    before, images = torch.get_num_threads(), []
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        images.append(image_and_gradients(tensors, view, "numba", torch.float32))
+    torch.set_num_threads(before)
+    for image, gradients in images[1:]:
+        torch.testing.assert_close(image, images[0][0], atol=1e-6, rtol=0)
+        for a, b in zip(gradients, images[0][1], strict=True):
+            torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-5)
+
+
 def test_depth_order_is_exact_over_a_large_range_of_depths():
     tensors = scene(200, size=0.2)
     tensors[0][0] *= 1e5  # must not coarsen the order of the others

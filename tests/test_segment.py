@@ -719,6 +719,15 @@ def test_what_another_motion_merely_hides_goes_to_the_part_that_it_touches(monke
         np.testing.assert_array_equal(found, np.repeat([0, 1, label, 2], [400, 225, 64, 225]))
 
 
+def test_a_back_between_two_fronts_follows_the_nearer(monkeypatch) -> None:
+    monkeypatch.setattr("hingesplat.pieces.may_go", lambda surface, *_: np.ones(len(surface.points), bool))
+    monkeypatch.setattr("hingesplat.pieces.hidden", lambda surface, *_: np.repeat([False, True], [675, 225]))
+    points = np.concatenate([patch((0, 0, z), 15) for z in (0.9, 0.03, -0.05, 0)])
+    given = np.repeat([1, 2, 3, 1], 225)
+    for found in follow_fronts([TURN.T] * 3, (given, given), (plain(points), plain(points)), 1.0):
+        np.testing.assert_array_equal(found, np.repeat([1, 2, 3, 2], 225))
+
+
 @pytest.mark.parametrize(("thick", "label"), [(0.04, 2), (0.1, 1)])
 def test_the_back_of_a_plate_follows_its_front(monkeypatch, thick: float, label: int) -> None:
     """Two doors one above the other: both motions take the inside of the second, thought to be the first's, out of
@@ -762,6 +771,13 @@ def test_what_neither_state_shows_to_have_gone_has_not_moved(monkeypatch) -> Non
     assert motions == [SHIFT]
     for found in labels:
         np.testing.assert_array_equal(found, np.repeat([0, 1, 0], [1000, 50, 50]))
+
+
+def test_a_long_panel_that_slides_over_itself_has_moved(monkeypatch) -> None:
+    monkeypatch.setattr("hingesplat.pieces.gone", lambda *_: np.repeat([False, True, False], [1000, 120, 880]))
+    label, surfaces = np.repeat([0, 1], [1000, 1000]), (plain(np.zeros((2000, 3))), plain(np.zeros((2000, 3))))
+    assert seen_to_move([SHIFT], (label, label), surfaces, 25)[0] == [SHIFT]
+    assert seen_to_move([SHIFT], (label, label), surfaces, 35)[0] == []
 
 
 @pytest.mark.parametrize("kind", ["revolute", "prismatic"])

@@ -46,6 +46,22 @@ def test_parallel_passes_errors_on():
         parallel(fail, 2)
 
 
+def test_parallel_waits_for_the_others_where_one_fails():
+    ended = []
+
+    def fail(t, threads):
+        if t == 1:
+            raise ZeroDivisionError
+        time.sleep(0.05 * t)
+        ended.append(t)
+
+    with pytest.raises(ZeroDivisionError):
+        parallel(fail, 3)
+    assert sorted(ended) == [0, 2]
+    parallel(lambda t, threads: ended.append(t), 3)
+    assert sorted(ended) == [0, 0, 1, 2, 2]
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 def test_parallel_works_after_a_fork():
     parallel(lambda t, threads: None, 2)

@@ -16,7 +16,7 @@ from hingesplat.search import BASE, Motion, ScoreVolume, inverted, scan
 from hingesplat.stereo import Cloud
 from hingesplat.surface import Surface, components
 
-PLATE = 0.2
+FLAT = 0.2
 """Thickness of a plate, beside its sides."""
 PATCH = 60
 """Seeds of a large piece for each patch that may be a part of its own."""
@@ -104,7 +104,7 @@ def edges(points: np.ndarray) -> list[Motion]:
         return sides, np.quantile(flat @ sides.T, [0.01, 0.99], axis=0)
 
     sides, corners = min(map(rectangle, np.radians(np.arange(0, 90, 2))), key=lambda r: float(np.ptp(r[1], 0).prod()))
-    if np.ptp(np.quantile(across, [0.1, 0.9])) > PLATE * np.sqrt(np.ptp(corners, 0).prod()):
+    if np.ptp(np.quantile(across, [0.1, 0.9])) > FLAT * np.sqrt(np.ptp(corners, 0).prod()):
         return []
     along, centre = sides @ principal[:2], corners.mean(0)
     found = []

@@ -24,7 +24,8 @@ HINGE = 0.02
 LINKED = 0.25
 """Links across a hinge line that make one part of what lies on both sides, for every point that it is long."""
 GONE = 0.3
-"""Share of a part's points that one of the states at least must show to have gone."""
+"""Share of a part's points that one of the states at least must show to have gone, or four times the fewest of a part:
+a long panel slides over itself."""
 PLATE = 0.06
 """Extents between the two sides of a plate at most."""
 UPON = 0.01
@@ -188,6 +189,7 @@ def follow_fronts(
         firm = [
             KDTree(points[(owned[s] == k + 1) & ~lost[k] & may_go(surfaces[s], other, T)]) for k, T in enumerate(ways)
         ]
+        nearest = np.full(len(points), PLATE * extent)
         for j, k in permutations(range(len(T_1_0)), 2):
             loose = np.flatnonzero((owned[s] == j + 1) & lost[j] & lost[k])
             if not (firm[j].n and firm[k].n and len(loose)):
@@ -195,9 +197,10 @@ def follow_fronts(
             own, front = (np.asarray(firm[i].query(points[loose])[0]) for i in (j, k))
             piece = components(points[loose], 0.025 * extent)
             for p in np.unique(piece):
-                gap = front[piece == p].mean()
-                if gap < min(PLATE * extent, own[piece == p].mean() / 2):
-                    labels[s][loose[piece == p]] = k + 1
+                mine, gap = loose[piece == p], front[piece == p].mean()
+                closer = mine[gap < nearest[mine]]
+                if gap < own[piece == p].mean() / 2:
+                    labels[s][closer], nearest[closer] = k + 1, gap
     return labels
 
 
@@ -212,10 +215,9 @@ def seen_to_move(
     counts = [np.bincount(label, minlength=1 + len(motions))[1:] for label in owned]
     shown = [c > min(LEAST_SHARE * len(label), min_points - 1) for c, label in zip(counts, owned, strict=True)]
     went = [gone(surfaces[s], surfaces[1 - s].sight) for s in (0, 1)]
-    share = [
-        np.bincount(o, g, 1 + len(motions))[1:] / np.maximum(c, 1) for o, g, c in zip(owned, went, counts, strict=True)
-    ]
-    kept = np.flatnonzero(shown[0] & shown[1] & (np.maximum(*share) > GONE))
+    many = [np.bincount(o, g, 1 + len(motions))[1:] for o, g in zip(owned, went, strict=True)]
+    moved_on = [(m > GONE * c) | (m > 4 * min_points) for m, c in zip(many, counts, strict=True)]
+    kept = np.flatnonzero(shown[0] & shown[1] & (moved_on[0] | moved_on[1]))
     rank = np.zeros(1 + len(motions), int)
     rank[1 + kept] = np.arange(1, 1 + len(kept))
     return [motions[int(k)] for k in kept], (rank[owned[0]], rank[owned[1]])

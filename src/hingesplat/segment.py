@@ -279,7 +279,10 @@ class _Case:
         owners: list[Pair] = []
         for _ in range(self.config.rounds):
             shared = one_for_two(self.evidence, candidates, owners)
-            candidates, prices = candidates + list(shared.values()), prices + [prices[k] for k, _ in shared]
+            candidates, prices = (
+                candidates + list(shared.values()),
+                prices + [max(prices[j], prices[k]) for j, k in shared],
+            )
             choices = Choices(self.problem, [m.T for m in candidates])
             kept = sorted(choices.best(np.array(prices), self.parts))
             owned = choices.labels(kept)
@@ -301,9 +304,14 @@ class _Case:
         if not hanging:
             return chosen
         more = self.settled([*chosen, *hanging], [self.config.hanging_cost] * (len(chosen) + len(hanging)))
-        alone = self.problem.alone([motion.T for motion in more])
-        more = [m for m, share in zip(more, alone, strict=True) if carrier_of(m, more) is None or share > ALONE]
-        return more if any(carrier_of(motion, more) is not None for motion in more) else chosen
+        # One after the other, since two that are alike are not alone, either of them.
+        while hang := [k for k, m in enumerate(more) if carrier_of(m, more) is not None]:
+            alone = self.problem.alone([motion.T for motion in more])
+            least = min(hang, key=lambda k: float(alone[k]))
+            if alone[least] > ALONE:
+                return more
+            more = more[:least] + more[least + 1 :]
+        return chosen
 
     def corrected(self, chosen: Sequence[Motion], photographs: Sequence[Sequence[Photograph]]) -> list[Motion]:
         """The motions, each corrected by the texture of what it owns in state 0."""

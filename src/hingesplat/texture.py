@@ -37,7 +37,7 @@ COST = 1.5
 LEAST, MOST = 0.5, 3.0
 """Shares of a motion's price to which texture may lower it, and raise it; what is not asked about yet has the first."""
 OTHERWISE = 0.3
-"""Share of the patches that go along with a motion, of which fewer may go along with any other."""
+"""Share of the patches that were compared under a motion; fewer may go along with any other."""
 DOUBT = 0.5
 """Share of the price that texture must say against a motion for others to be looked for."""
 
@@ -112,7 +112,7 @@ def vouched_for(
     if parts is not None and len(kept) >= parts:
         return prices
     for k, gain in choices.gains(kept).items():
-        if gain < LEAST * price:
+        if gain <= LEAST * price + 1:  # Less would not be chosen for that.
             break
         more = sorted(kept | {k})
         first, second = choices.labels(more)
@@ -156,6 +156,8 @@ def carried(
         photographs: of state 0 and of state 1, of part 0.
         extent: of the object, scene units.
     """
+    if len(points) == 0:
+        return np.zeros(0)
     centre = moved(points, T_1_0).mean(0)
 
     def place(theta: np.ndarray) -> np.ndarray:

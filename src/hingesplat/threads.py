@@ -48,31 +48,30 @@ class _Helper:
 
     def __init__(self) -> None:
         self._calls: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._answers: SimpleQueue[BaseException | None] = SimpleQueue()
         self._called, self._done = np.zeros(1, np.int64), np.zeros(1, np.int64)
-        self._error: BaseException | None = None
         threading.Thread(target=self._serve, name="hingesplat", daemon=True).start()
 
     def call(self, function: Callable[[], None]) -> None:
         self._calls.put(function)
         self._called[0] += 1
 
-    def finish(self) -> None:
-        """Wait for the call; raises what it raised."""
-        while not _awaits(self._done, self._called[0], _LOOKS, 0):
-            os.sched_yield() if hasattr(os, "sched_yield") else None
-        error, self._error = self._error, None
-        if error is not None:
-            raise error
+    def finish(self) -> BaseException | None:
+        """Wait for the call; what it raised."""
+        _awaits(self._done, self._called[0], _LOOKS, 0)
+        return self._answers.get()
 
     def _serve(self) -> None:
         while True:
             _awaits(self._called, self._done[0] + 1, _LOOKS, _HEAD_START)
-            function = self._calls.get()
+            function, answer = self._calls.get(), None
             try:
                 function()
             except BaseException as error:
-                self._error = error
+                answer = error
             del function  # what it was called with is not kept while there is nothing to do
+            self._answers.put(answer)
+            del answer
             self._done[0] += 1
 
 
@@ -87,21 +86,21 @@ def parallel(kernel: Callable[..., Any], threads: int, *args: Any) -> None:
     """Run ``kernel(*args, t, threads)`` for t = 0 … threads - 1 at once; the kernel must release the GIL.
 
     Plain Python threads instead of a Numba threading layer: they do not spin for long, may be entered from several
-    threads, survive a fork, and leave torch's thread count alone.
+    threads, survive a fork, and leave torch's thread count alone. Returns when all have ended; raises what one raised.
     """
-    helpers = []
-    for t in range(1, threads):
-        try:
-            helper = _idle.pop()
-        except IndexError:
-            helper = _Helper()
-        helper.call(lambda t=t: kernel(*args, t, threads))
-        helpers.append(helper)
+    helpers: list[_Helper] = []
     try:
+        for t in range(1, threads):
+            try:
+                helper = _idle.pop()
+            except IndexError:
+                helper = _Helper()
+            helper.call(lambda t=t: kernel(*args, t, threads))
+            helpers.append(helper)
         kernel(*args, 0, threads)
     finally:
-        for helper in helpers:
-            try:
-                helper.finish()
-            finally:
-                _idle.append(helper)
+        errors = [helper.finish() for helper in helpers]
+        _idle.extend(helpers)
+    for error in errors:
+        if error is not None:
+            raise error

@@ -247,19 +247,21 @@ def _copy_features(i, colors, channels, count, record, stride):
 @njit(**INNER)
 def _slice_depths(means, view, sample, pivots):
     """Depths that cut the Gaussians into slices of about as many each. Every thread finds the same."""
-    n = means.shape[0] // 3
+    n, seen = means.shape[0] // 3, 0
     for k in range(_SAMPLE):
         i = 3 * (k * n // _SAMPLE)
         depth = view[_T + 2]
         for axis in range(3):
             depth += view[_R + 6 + axis] * means[i + axis]
-        j = k
-        while j > 0 and sample[j - 1] > depth:
-            sample[j] = sample[j - 1]
-            j -= 1
-        sample[j] = depth
+        if depth > view[_NEAR]:  # What is no number is not.
+            j = seen
+            while j > 0 and sample[j - 1] > depth:
+                sample[j] = sample[j - 1]
+                j -= 1
+            sample[j] = depth
+            seen += 1
     for k in range(pivots.shape[0]):
-        pivots[k] = sample[(k + 1) * _SAMPLE // (pivots.shape[0] + 1)]
+        pivots[k] = sample[(k + 1) * seen // (pivots.shape[0] + 1)] if seen > 0 else view[_NEAR]
 
 
 @njit(**KERNEL)

@@ -76,7 +76,8 @@ def sort_and_offset(build, segments, record, stride, histogram, order, offsets, 
     """Sort the visible Gaussians by depth (stable, exact) into ``order``; lay out slots and tile lists.
 
     ``offsets`` (n + 1,) are the first slots of the Gaussians, ``starts`` (tiles + 1,) the first list entries
-    of the tiles. Returns the numbers of visible Gaussians and of segments.
+    of the tiles, and ``histogram[0]`` becomes those of their slices. Returns the numbers of visible Gaussians and of
+    segments.
     """
     n, visible, total = segments.shape[0], 0, 0
     low, high = np.int64(2**31), np.int64(0)
@@ -112,9 +113,12 @@ def sort_and_offset(build, segments, record, stride, histogram, order, offsets, 
     position = 0
     for tile in range(starts.shape[0] - 1):
         starts[tile] = position
-        for t in range(histogram.shape[0]):
-            for k in range(histogram.shape[1]):
-                position += histogram[t, k, tile]
+        for k in range(histogram.shape[1]):
+            count = 0
+            for t in range(histogram.shape[0]):
+                count += histogram[t, k, tile]
+            histogram[0, k, tile] = position
+            position += count
     starts[starts.shape[0] - 1] = position
     return visible, total
 
@@ -191,15 +195,10 @@ def _before(depth, order, visible, record, stride):
 
 @njit(**KERNEL)
 def fill_lists(
-    build, visible, order, boxes, record, stride, offsets, pivots, histogram, starts, columns, items, slots, shapes,
-    t, threads,
+    build, visible, order, boxes, record, stride, offsets, pivots, cursors, columns, items, slots, shapes, t, threads,
 ):  # fmt: skip
-    """Write the lists of the tiles, front to back; thread t takes a slice of depths."""
-    cursor = starts.copy()
-    for tile in range(histogram.shape[2]):
-        for k in range(t):
-            for other in range(threads):
-                cursor[tile] += histogram[other, k, tile]
+    """Write the lists of the tiles, front to back; thread t takes a slice of depths, from ``cursors[t]`` (tiles,)."""
+    cursor = cursors[t].copy()
     first = _before(pivots[t - 1], order, visible, record, stride) if t > 0 else 0
     last = _before(pivots[t], order, visible, record, stride) if t < threads - 1 else visible
     for j in range(first, last):

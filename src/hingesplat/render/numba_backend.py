@@ -26,6 +26,8 @@ CHANNEL_SIZES = (0, 1, 4, 8, 16)
 
 GAUSSIANS_PER_THREAD = 1024
 """With fewer, another thread costs more than it brings."""
+MOST_THREADS = 16
+"""For what counts the tiles' work grows with their square."""
 
 _BUILD = Build(Path(__file__).parent.glob("*.py"))
 
@@ -127,7 +129,7 @@ def _draw(
     n, count = channels.shape
     planes = next(size for size in CHANNEL_SIZES if size >= count) + 4  # colours and depth
     build, view = _BUILD.with_planes(planes), _view(camera)
-    threads = min(torch.get_num_threads(), 1 + n // GAUSSIANS_PER_THREAD)
+    threads = min(torch.get_num_threads(), 1 + n // GAUSSIANS_PER_THREAD, MOST_THREADS)
     width, height = camera.width, camera.height
     columns, rows = -(-width // TILE), -(-height // TILE)
     stride = -(-(REC_FEATURES + planes) // 4) * 4
@@ -142,7 +144,7 @@ def _draw(
     starts = np.empty(columns * rows + 1, np.int64)
     visible, total = sort_and_offset(_BUILD, segments, record, stride, histogram, order, offsets, starts)
     items, slots, shapes = (np.empty(total, np.int32) for _ in range(3))
-    lists = (record, stride, offsets, pivots, histogram, starts, columns, items, slots, shapes)
+    lists = (record, stride, offsets, pivots, histogram[0], columns, items, slots, shapes)
     parallel(fill_lists, threads, _BUILD, visible, order, boxes, *lists)
     tiles = np.argsort(starts[:-1] - starts[1:], kind="stable")  # the longest lists first, for balance
 
