@@ -119,9 +119,8 @@ def test_groups_are_pieces_and_patches_of_the_large_ones() -> None:
     speck = patch((5, 5, 0), 3)
     small, large = patch((0, 0, 0), 10), patch((3, 0, 0), 30)
     groups = groups_to_try(np.concatenate([speck, small, large]), 1.0, seed=0)
-    whole = [g for g in groups if len(g) in (100, 900)]
-    assert {tuple(g) for g in whole} == {tuple(range(9, 109)), tuple(range(109, 1009))}
-    patches = [g for g in groups if len(g) not in (100, 900)]
+    assert {tuple(g) for g, whole in groups if whole} == {tuple(range(9, 109)), tuple(range(109, 1009))}
+    patches = [g for g, whole in groups if not whole]
     assert len(patches) == min(900 // PATCH, 10) and min(map(len, patches)) >= 12
     assert sorted(np.concatenate(patches)) == list(range(109, 1009))
     assert groups_to_try(speck[:0], 1.0, seed=0) == []

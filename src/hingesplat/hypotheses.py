@@ -61,19 +61,22 @@ class Evidence:
         return self.surfaces[0].blurred(), self.surfaces[1].blurred()
 
 
-def groups_to_try(points: np.ndarray, extent: float, seed: int) -> list[np.ndarray]:
-    """Connected pieces of the seeds, and patches of the pieces that are large enough to be several parts at once."""
+def groups_to_try(points: np.ndarray, extent: float, seed: int) -> list[tuple[np.ndarray, bool]]:
+    """Connected pieces of the seeds, and patches of the pieces that are large enough to be several parts at once.
+
+    Each with whether it is a whole piece.
+    """
     label = components(points, 0.035 * extent)
     groups = []
     for piece in range(label.max(initial=-1) + 1):
         index = np.flatnonzero(label == piece)
         if len(index) < 12:
             continue
-        groups.append(index)
+        groups.append((index, True))
         patches = min(len(index) // PATCH, 10)
         if patches >= 2:
             which = kmeans2(points[index], patches, rng=np.random.default_rng(seed), minit="++")[1]
-            groups += [index[which == p] for p in range(patches) if (which == p).sum() >= 12]
+            groups += [(index[which == p], False) for p in range(patches) if (which == p).sum() >= 12]
     return groups
 
 
@@ -124,12 +127,13 @@ def propose(evidence: Evidence, seeds: Sequence[np.ndarray], after: np.ndarray =
     groups = []
     for s in (0, 1):
         p = surfaces[s].points[seeds[s]]
-        groups += [(s, seeds[s][g]) for g in groups_to_try(p, e.extent, seed=int(e.rng.integers(2**31)))]
+        tried = groups_to_try(p, e.extent, seed=int(e.rng.integers(2**31)))
+        groups += [(s, seeds[s][index], whole) for index, whole in tried]
     if not groups:
         return []
-    directions = axis_directions([surfaces[s].points[g] for s, g in groups])
+    directions = axis_directions([surfaces[s].points[g] for s, g, _ in groups])
     pool = []
-    for s, group in groups:
+    for s, group, whole in groups:
         chosen = e.rng.choice(group, min(e.config.seeds_per_search, len(group)), replace=False)
         p, c = surfaces[s].points[chosen], surfaces[s].colours[chosen]
         blurred, then = e.blurred[s][chosen], after if s == 0 else np.linalg.inv(after)
@@ -139,7 +143,7 @@ def propose(evidence: Evidence, seeds: Sequence[np.ndarray], after: np.ndarray =
             pool.append(motion if s == 0 else inverted(motion))
 
         # Of a door that shows its inside in one state and its outside in the other little meets: an edge is its hinge.
-        for edge in edges(surfaces[s].points[group]) if len(group) >= PATCH else []:
+        for edge in edges(surfaces[s].points[group]) if whole and len(group) >= PATCH else []:
             for motion in scan("revolute", p, blurred, edge.axis[None], e.coarse[1 - s], near=edge, after=then, keep=1):
                 add(motion)
         # Slides get a hearing of their own: with three numbers fewer they are seldom the luckiest fit.
