@@ -1,5 +1,6 @@
 """The bookkeeping of benchmarks: what is there is kept, what fails is a row, tables are made of recorded rows."""
 
+import importlib
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -354,3 +355,14 @@ def test_wrong_tables_and_objects_exit_with_2(capfd) -> None:
     for args in (["table", "3"], ["bench", "--objects", "teapot"], ["bench", "--preset", "quick"]):
         assert cli.main(args) == 2
         assert capfd.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["cpp", "pixelwise", "warp_port", "taichi_port"])
+def test_yardsticks_draw_what_ours_draws(monkeypatch, name: str) -> None:
+    """What ours is measured against leans on parts of it, and is no yardstick once these have changed."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    rasteriser = importlib.import_module("rasteriser")
+    yardstick = importlib.import_module(f"peers.{name}")
+    if (why := getattr(yardstick, "why_not", lambda: None)()) is not None:
+        pytest.skip(why)
+    rasteriser.check(name, rasteriser.peer(yardstick, *rasteriser.SMALL))

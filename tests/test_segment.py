@@ -719,8 +719,8 @@ def test_what_another_motion_merely_hides_goes_to_the_part_that_it_touches(monke
 
 
 def test_a_back_between_two_fronts_follows_the_nearer(monkeypatch) -> None:
-    monkeypatch.setattr("hingesplat.pieces.may_go", lambda surface, *_: np.ones(len(surface.points), bool))
-    monkeypatch.setattr("hingesplat.pieces.hidden", lambda surface, *_: np.repeat([False, True], [675, 225]))
+    may, lost = np.ones(900, bool), np.repeat([False, True], [675, 225])
+    monkeypatch.setattr("hingesplat.pieces.whereabouts", lambda *_: (may, lost))
     points = np.concatenate([patch((0, 0, z), 15) for z in (0.9, 0.03, -0.05, 0)])
     given = np.repeat([1, 2, 3, 1], 225)
     for found in follow_fronts([TURN.T] * 3, (given, given), (plain(points), plain(points)), 1.0):
@@ -731,9 +731,9 @@ def test_a_back_between_two_fronts_follows_the_nearer(monkeypatch) -> None:
 def test_the_back_of_a_plate_follows_its_front(monkeypatch, thick: float, label: int) -> None:
     """Two doors one above the other: both motions take the inside of the second, thought to be the first's, out of
     sight."""
-    monkeypatch.setattr("hingesplat.pieces.may_go", lambda surface, *_: np.ones(len(surface.points), bool))
     first, second, back = (patch((0, 0, z), 15) for z in (0.5, -0.5, -0.5 - thick))
-    monkeypatch.setattr("hingesplat.pieces.hidden", lambda surface, *_: np.repeat([False, True], [850, 225]))
+    may, lost = np.ones(1075, bool), np.repeat([False, True], [850, 225])
+    monkeypatch.setattr("hingesplat.pieces.whereabouts", lambda *_: (may, lost))
     points = np.concatenate([BASE, first, second, back])
     given = np.repeat([0, 1, 2, 1], [400, 225, 225, 225])
     turn = replace(TURN, pivot=np.zeros(3))
@@ -792,7 +792,9 @@ def test_what_lands_in_another_drawer_is_of_that_drawer(monkeypatch) -> None:
     """Two drawers side by side, a cabinet before y = 0 of which photographs see what stays outside. One is open by 0.1,
     the other by 0.3, and the back of its bottom is thought to take the shorter way."""
     motions = [prismatic(np.eye(3)[1], 0.1), prismatic(np.eye(3)[1], 0.3)]
-    monkeypatch.setattr("hingesplat.pieces.may_go", lambda surface, _, T: moved(surface.points, T)[:, 1] > -1e-9)
+    monkeypatch.setattr(
+        "hingesplat.pieces.whereabouts", lambda surface, _, T: (moved(surface.points, T)[:, 1] > -1e-9, None)
+    )
     x, y = (grid.ravel() for grid in np.meshgrid(np.arange(0, 0.4, 0.01), np.arange(-0.3, 0.05, 0.01)))
     bottoms = [np.stack([x, y, 0 * x], 1)[y > -0.1], np.stack([x + 0.5, y, 0 * x], 1)]
     fronts = [np.stack([x + aside, 0 * x, y], 1) for aside in (0, 0.5)]

@@ -126,10 +126,11 @@ class Rasteriser:
         width, height = self.camera.width, self.camera.height
         columns, rows = -(-width // SIDE), -(-height // SIDE)
         self.record, boxes = np.empty((n, 16), np.float32), np.empty((n, 4), np.int32)
-        segments, histogram = np.empty(n, np.int32), np.zeros((1, -(-width // TILE) * -(-height // TILE)), np.int64)
+        segments, pivots = np.empty(n, np.int32), np.empty(0, np.float32)
+        histogram = np.zeros((1, 1, -(-width // TILE) * -(-height // TILE)), np.int64)
         flat = [a.reshape(-1) for a in inputs]
         nothing = np.zeros(0, np.float32)
-        targets = (self.record.reshape(-1), boxes.reshape(-1), segments, histogram)
+        targets = (self.record.reshape(-1), boxes.reshape(-1), segments, pivots, histogram)
         project(_BUILD, *flat, nothing, self.view, *targets, 0, 1)
         self.seen = segments > 0
         visible = np.flatnonzero(self.seen)

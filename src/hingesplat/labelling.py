@@ -61,15 +61,20 @@ def label_costs(
     return np.stack(columns, 1)
 
 
+def whereabouts(surface: Surface, other: Sight, T: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Points that may follow T (4, 4), since nobody in the other state sees through them there; those lost on the way.
+
+    Returns:
+        (n,) bool each. Who is lost may be there, but nobody sees it.
+    """
+    contradiction, arrived, _ = _told(surface, other, T)
+    may = contradiction < 0.1
+    return may, may & (arrived < 0.3)
+
+
 def hidden(surface: Surface, other: Sight, T: np.ndarray | None = None) -> np.ndarray:
     """(n,) bool: points that nobody sees in the other state, nor sees through, where T (4, 4) takes them."""
-    contradiction, arrived, _ = _told(surface, other, T)
-    return (contradiction < 0.1) & (arrived < 0.3)
-
-
-def may_go(surface: Surface, other: Sight, T: np.ndarray) -> np.ndarray:
-    """(n,) bool: points that nobody sees through in the other state where T (4, 4) takes them."""
-    return _told(surface, other, T)[0] < 0.1
+    return whereabouts(surface, other, T)[1]
 
 
 def gone(surface: Surface, other: Sight) -> np.ndarray:

@@ -6,7 +6,7 @@ from itertools import permutations
 import numpy as np
 from scipy.spatial import KDTree
 
-from hingesplat.labelling import HIDDEN_COST, gone, hidden, label_costs, may_go
+from hingesplat.labelling import HIDDEN_COST, gone, label_costs, whereabouts
 from hingesplat.screw import matrix_to_screw
 from hingesplat.se3 import moved
 from hingesplat.search import Motion
@@ -152,8 +152,10 @@ def give_way(T_1_0: Sequence[np.ndarray], owned: Labels, surfaces: tuple[Surface
     lies there in what took the longer, whose front photographs would see if it had taken the shorter.
     """
     ways = [list(T_1_0), [np.linalg.inv(T) for T in T_1_0]]
-    may = [[may_go(surfaces[s], surfaces[1 - s].sight, T) for T in ways[s]] for s in (0, 1)]
     labels = (owned[0].copy(), owned[1].copy())
+    if len(T_1_0) < 2:
+        return labels
+    may = [[whereabouts(surfaces[s], surfaces[1 - s].sight, T)[0] for T in ways[s]] for s in (0, 1)]
     for s in (0, 1):
         here, there = surfaces[s].points, surfaces[1 - s].points
         for j, k in permutations(range(len(T_1_0)), 2):
@@ -183,12 +185,12 @@ def follow_fronts(
         owned: label of each point, 0 for the base.
     """
     labels = (owned[0].copy(), owned[1].copy())
+    if len(T_1_0) < 2:
+        return labels
     for s, ways in enumerate((T_1_0, [np.linalg.inv(T) for T in T_1_0])):
-        points, other = surfaces[s].points, surfaces[1 - s].sight
-        lost = [hidden(surfaces[s], other, T) for T in ways]
-        firm = [
-            KDTree(points[(owned[s] == k + 1) & ~lost[k] & may_go(surfaces[s], other, T)]) for k, T in enumerate(ways)
-        ]
+        points = surfaces[s].points
+        may, lost = zip(*(whereabouts(surfaces[s], surfaces[1 - s].sight, T) for T in ways), strict=True)
+        firm = [KDTree(points[(owned[s] == k + 1) & may[k] & ~lost[k]]) for k in range(len(ways))]
         nearest = np.full(len(points), PLATE * extent)
         for j, k in permutations(range(len(T_1_0)), 2):
             loose = np.flatnonzero((owned[s] == j + 1) & lost[j] & lost[k])

@@ -232,6 +232,17 @@ def take_ticket(typingctx, counter):
 
 
 @intrinsic
+def seen(typingctx, counter):
+    """counter[0] (int64) as other threads have left it, and with it all that they wrote before."""
+
+    def code(context, builder, sig, args):
+        data = make_array(sig.args[0])(context, builder, args[0]).data
+        return builder.load_atomic(data, "acquire", 8)
+
+    return types.int64(counter), code
+
+
+@intrinsic
 def float_bits(typingctx, x):
     """The bits of a float32; as an integer they are ordered like the number where it is positive."""
 

@@ -6,13 +6,10 @@ from collections.abc import Callable
 from queue import SimpleQueue
 from typing import Any
 
-import numba.extending
 import numpy as np
 from numba import njit
-from numba.core import types
-from numba.np.arrayobj import make_array
 
-intrinsic: Any = numba.extending.intrinsic  # it drops the first parameter, which a type checker cannot know
+from hingesplat.simd import seen
 
 _LOOKS = 100_000
 """Looks, about a nanosecond each, for which a thread stays awake: to be woken takes it longer than most kernels need
@@ -21,24 +18,13 @@ _HEAD_START = 3_000
 """Looks that a helper lets pass when it is called: meanwhile the caller enters its kernel and lets go of the GIL."""
 
 
-@intrinsic
-def _seen(typingctx, counter):
-    """counter[0] (int64) as other threads have left it."""
-
-    def code(context, builder, sig, args):
-        data = make_array(sig.args[0])(context, builder, args[0]).data
-        return builder.load_atomic(data, "acquire", 8)
-
-    return types.int64(counter), code
-
-
 @njit(cache=True, nogil=True)
 def _awaits(counter, value, looks, more):  # pragma: no cover - compiled
     """Whether the counter gets to the value within so many looks; ``more`` pass after that."""
     for _ in range(looks):
-        if _seen(counter) >= value:
+        if seen(counter) >= value:
             for _ in range(more):
-                _seen(counter)
+                seen(counter)
             return True
     return False
 

@@ -287,7 +287,8 @@ def project(
     These are counted in slices of depth, for ``fill_lists``; ``pivots`` (threads - 1,) become their bounds.
     """
     n = opacities.shape[0]
-    _slice_depths(means, view, np.empty(_SAMPLE, np.float32), pivots)
+    if threads > 1:
+        _slice_depths(means, view, np.empty(_SAMPLE, np.float32), pivots)
     count, stride = channels.shape[0] // n, record.shape[0] // n
     blocks = (n + LANES - 1) // LANES
     first, last = t * blocks // threads * LANES, min((t + 1) * blocks // threads * LANES, n)
