@@ -466,6 +466,20 @@ def test_texture_is_asked_about_what_is_chosen_and_may_have_it_replaced(turned: 
     assert told_apart(Choices(Labelling.of(surfaces, extent), [TURN.T]), against({0: 1e6}), 20, None) == {0: 60}
 
 
+def test_something_moved_so_one_motion_is_had_for_half_its_price(turned: Turned) -> None:
+    """The blade of a small knife explains 48 points for a price of 50."""
+    _, surfaces, extent = turned
+    choices = Choices(Labelling.of(surfaces, extent), [TURN.T, inverted(TURN).T])
+    gain = choices.gains(frozenset())[0]
+
+    def chosen(price: float) -> dict[int, float]:
+        return told_apart(choices, lambda *_: 0.0, price, None)
+
+    assert chosen(0.5 * gain) == {0: 0.5 * gain}
+    assert chosen(1.5 * gain) == {0: 0.75 * gain}
+    assert chosen(2.5 * gain) == {}
+
+
 def test_texture_buys_a_motion_of_its_own_at_half_the_price() -> None:
     """Two drawers pulled out by nearly the same: motion 1 explains 30 points besides motion 0."""
     asked, those = set(), []

@@ -1,6 +1,7 @@
 """Texture goes where the motion takes it, and that of a look-alike is another, on a card drawn by rays."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
@@ -10,6 +11,7 @@ from card import CARD, HALF, photographs, place
 from hingesplat.patches import Photograph
 from hingesplat.se3 import moved
 from hingesplat.search import Motion
+from hingesplat.segment import SegmentConfig, _Case
 from hingesplat.surface import Surface
 from hingesplat.texture import TextureConfig, carried, fitted, photographs_of
 from hingesplat.visibility import Sight
@@ -57,6 +59,25 @@ def test_a_motion_is_corrected_by_the_texture_it_carries(kind: str) -> None:
     assert fitted(off, surface, other, 1.0) is off
     assert fitted(off, surface.rows(np.zeros(0, int)), other, 1.0) is off
     assert fitted(off, surface, ([], other[1]), 1.0) is off
+
+
+@pytest.mark.parametrize("shows", [0, 1])
+def test_the_texture_that_one_state_shows_of_a_part_corrects_its_motion(shows: int) -> None:
+    """In the other nothing is labelled as the part's."""
+    exact = place("prismatic")(STILL)[1]
+    right = Motion("prismatic", FORWARD, PIVOT, SLIDE, 1.0)
+    there = Surface(moved(POINTS, exact), 0 * POINTS, EITHER_SIDE, cast(Sight, None))
+    surfaces = Surface(POINTS, 0 * POINTS, EITHER_SIDE, cast(Sight, None)), there
+    labels = [np.full(len(POINTS), int(s == shows)) for s in (0, 1)]
+    case = SimpleNamespace(
+        problem=SimpleNamespace(surfaces=surfaces, labels=lambda _: labels),
+        evidence=SimpleNamespace(rng=np.random.default_rng(0), extent=1.0),
+        config=SegmentConfig(),
+    )
+    off = replace(right, value=SLIDE + 0.006)
+    (found,) = _Case.corrected(cast(_Case, case), [off], photographs("prismatic", part=0))
+    assert found.by_texture and abs(found.value - SLIDE) < 4e-4
+    assert np.abs(moved(POINTS, found.T) - moved(POINTS, exact)).max() < 4e-4
 
 
 def test_a_look_alike_has_a_texture_of_its_own() -> None:

@@ -314,13 +314,16 @@ class _Case:
         return chosen
 
     def corrected(self, chosen: Sequence[Motion], photographs: Sequence[Sequence[Photograph]]) -> list[Motion]:
-        """The motions, each corrected by the texture of what it owns in state 0."""
-        here, label = self.problem.surfaces[0], self.problem.labels([m.T for m in chosen])[0]
-        mine = [self.evidence.rng.permutation(np.flatnonzero(label == k + 1)) for k in range(len(chosen))]
-        return [
-            fitted(m, here.rows(own[: self.config.texture.corrected]), photographs, self.evidence.extent)
-            for m, own in zip(chosen, mine, strict=True)
-        ]
+        """The motions, each corrected by the texture of what it owns in state 0, then of what it owns in state 1."""
+        labels = self.problem.labels([m.T for m in chosen])
+
+        def by_texture_of(s: int, k: int, motion: Motion) -> Motion:
+            own = self.evidence.rng.permutation(np.flatnonzero(labels[s] == k + 1))[: self.config.texture.corrected]
+            some = self.problem.surfaces[s].rows(own)
+            return fitted(motion, some, (photographs[s], photographs[1 - s]), self.evidence.extent)
+
+        first = [by_texture_of(0, k, m) for k, m in enumerate(chosen)]
+        return [inverted(by_texture_of(1, k, inverted(m))) for k, m in enumerate(first)]
 
 
 def _labelled(

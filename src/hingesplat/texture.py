@@ -49,7 +49,7 @@ class TextureConfig:
     patches: int = 100
     """Of what a motion carries from each state to the other, at most; 0 leaves look-alikes to points and colours."""
     corrected: int = 300
-    """Of what a motion carries from state 0, at most, when the motion found is corrected by them."""
+    """Of what a motion carries from each state to the other, at most, when the motion found is corrected by them."""
     views: int = 40
     """Photographs of each state that are compared, at most."""
     size: int = 500
@@ -62,7 +62,8 @@ def told_apart(
     """The motions that explain both states at the least description length, texture counting, and their prices.
 
     It is asked about those chosen. If it speaks against one of them, prices are by what it says, and it is asked about
-    all that might be chosen instead; else it has no say.
+    all that might be chosen instead; else it has no say. If none is worth its price, one is had for half of it:
+    something moved.
 
     Args:
         verdict: what texture says, in points, against the motion of this number, which owns these points (n,) bool of
@@ -70,6 +71,8 @@ def told_apart(
         price: of each motion, in points.
         parts: choose no more than this many.
     """
+    if not choices.best(np.full(choices.number, price, float), parts):
+        price, parts = LEAST * price, 1
     said: dict[int, float] = {}
     prices = np.full(choices.number, price, float)
     while True:
@@ -170,7 +173,10 @@ def carried(
 
 
 def fitted(motion: Motion, surface: Surface, photographs: Sequence[Sequence[Photograph]], extent: float) -> Motion:
-    """The motion, corrected so that the texture of this part of state 0's surface goes along, if then it does."""
+    """The motion, corrected so that the texture of this part of a surface goes along, if then it does.
+
+    The surface is that of the state where the motion begins, whose photographs come first.
+    """
     across, turns = axes_across(motion.axis), motion.kind == "revolute"
 
     def joint(theta: np.ndarray) -> Motion:
