@@ -14,8 +14,10 @@ from hingesplat.render.numba_backend import _view
 from hingesplat.render.torch_backend import TRANSMITTANCE_MIN
 
 SOURCE = Path(__file__).with_name("engine.cpp")
-FLAGS = ("-O3", "-march=native", "-ffast-math", "-fno-finite-math-only", "-std=c++17", "-shared", "-fPIC", "-w")
-"""The liberties with floating point that our kernels take, too: not those that assume away NaN."""
+FLAGS = ("-O3", "-march=native", "-ffast-math", "-fno-finite-math-only", "-std=c++17", "-fPIC", "-w")
+"""The liberties with floating point that our kernels take, too: not those that assume away NaN. Only for compiling:
+linked with them, a library rounds the smallest numbers of the whole process to 0 as soon as it is loaded, and some of
+SciPy's trees then crash."""
 
 
 def why_not() -> str | None:
@@ -33,8 +35,9 @@ def _library() -> ctypes.CDLL:
     target = Path(tempfile.gettempdir()) / f"hingesplat-engine-{digest}.so"
     if not target.is_file():
         with tempfile.TemporaryDirectory() as folder:
-            made = Path(folder) / "engine.so"
-            subprocess.run(["g++", *FLAGS, "-o", str(made), str(SOURCE)], check=True)
+            compiled, made = Path(folder) / "engine.o", Path(folder) / "engine.so"
+            subprocess.run(["g++", *FLAGS, "-c", "-o", str(compiled), str(SOURCE)], check=True)
+            subprocess.run(["g++", "-shared", "-o", str(made), str(compiled)], check=True)
             shutil.move(made, target)
     library = ctypes.CDLL(str(target))
     pointer, whole, real = ctypes.c_void_p, ctypes.c_int64, ctypes.c_float

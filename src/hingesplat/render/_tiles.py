@@ -198,7 +198,7 @@ def fill_lists(
     build, visible, order, boxes, record, stride, offsets, pivots, cursors, columns, items, slots, shapes, t, threads,
 ):  # fmt: skip
     """Write the lists of the tiles, front to back; thread t takes a slice of depths, from ``cursors[t]`` (tiles,)."""
-    cursor = cursors[t].copy()
+    cursor = cursors[t]
     first = _before(pivots[t - 1], order, visible, record, stride) if t > 0 else 0
     last = _before(pivots[t], order, visible, record, stride) if t < threads - 1 else visible
     for j in range(first, last):
