@@ -367,7 +367,7 @@ def test_yardsticks_draw_what_ours_draws(monkeypatch, name: str) -> None:
     yardstick = importlib.import_module(f"peers.{name}")
     if (why := getattr(yardstick, "why_not", lambda: None)()) is not None:
         pytest.skip(why)
-    # In a process of its own: what others' code does to memory is not felt by other tests.
+    # In a process of its own: how the code of others has the processor round is not felt by other tests.
     code = f"import rasteriser as r; from peers import {name}; r.check({name!r}, r.peer({name}, *r.SMALL))"
     code += "; assert r.np.array([1e-310]) * 1.0 > 0"
     done = subprocess.run([sys.executable, "-c", code], cwd=benchmarks, capture_output=True, text=True, timeout=300)

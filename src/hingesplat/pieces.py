@@ -145,7 +145,26 @@ def reattach_fragments(
     return labels
 
 
-def give_way(T_1_0: Sequence[np.ndarray], owned: Labels, surfaces: tuple[Surface, Surface], extent: float) -> Labels:
+Whereabouts = tuple[list[np.ndarray], list[np.ndarray]]
+"""For each state, of every motion: ``whereabouts`` of all its points, (2, n) bool."""
+
+
+def whereabouts_under(T_1_0: Sequence[np.ndarray], surfaces: tuple[Surface, Surface]) -> Whereabouts:
+    """Which points may follow each motion, and which of them are lost on the way."""
+    first, second = surfaces
+    return (
+        [np.stack(whereabouts(first, second.sight, T)) for T in T_1_0],
+        [np.stack(whereabouts(second, first.sight, np.linalg.inv(T))) for T in T_1_0],
+    )
+
+
+def give_way(
+    T_1_0: Sequence[np.ndarray],
+    owned: Labels,
+    surfaces: tuple[Surface, Surface],
+    extent: float,
+    told: Whereabouts,
+) -> Labels:
     """Labels in which points that land where another part does go along with it, if they may and that part must.
 
     Of two drawers side by side, each motion hides the other's bottom, too. What took the shorter way into the cabinet
@@ -153,9 +172,7 @@ def give_way(T_1_0: Sequence[np.ndarray], owned: Labels, surfaces: tuple[Surface
     """
     ways = [list(T_1_0), [np.linalg.inv(T) for T in T_1_0]]
     labels = (owned[0].copy(), owned[1].copy())
-    if len(T_1_0) < 2:
-        return labels
-    may = [[whereabouts(surfaces[s], surfaces[1 - s].sight, T)[0] for T in ways[s]] for s in (0, 1)]
+    may = [[m for m, _ in told[s]] for s in (0, 1)]
     for s in (0, 1):
         here, there = surfaces[s].points, surfaces[1 - s].points
         for j, k in permutations(range(len(T_1_0)), 2):
@@ -171,28 +188,20 @@ def give_way(T_1_0: Sequence[np.ndarray], owned: Labels, surfaces: tuple[Surface
     return labels
 
 
-def follow_fronts(
-    T_1_0: Sequence[np.ndarray], owned: Labels, surfaces: tuple[Surface, Surface], extent: float
-) -> Labels:
+def follow_fronts(owned: Labels, surfaces: tuple[Surface, Surface], extent: float, told: Whereabouts) -> Labels:
     """Labels in which the back of a plate is the part's whose front is right before it.
 
     What two motions take out of sight may follow either: of two doors one above the other that open by nearly the same,
     the inside of one was the other's. A piece of such points goes along with those that both states show of a part, if
     they are no farther than a plate is thick and twice as close as those of its own.
-
-    Args:
-        T_1_0: (4, 4) motion of each part from state 0 to state 1.
-        owned: label of each point, 0 for the base.
     """
     labels = (owned[0].copy(), owned[1].copy())
-    if len(T_1_0) < 2:
-        return labels
-    for s, ways in enumerate((T_1_0, [np.linalg.inv(T) for T in T_1_0])):
+    for s in (0, 1):
         points = surfaces[s].points
-        may, lost = zip(*(whereabouts(surfaces[s], surfaces[1 - s].sight, T) for T in ways), strict=True)
-        firm = [KDTree(points[(owned[s] == k + 1) & may[k] & ~lost[k]]) for k in range(len(ways))]
+        lost = [away for _, away in told[s]]
+        firm = [KDTree(points[(owned[s] == k + 1) & may & ~away]) for k, (may, away) in enumerate(told[s])]
         nearest = np.full(len(points), PLATE * extent)
-        for j, k in permutations(range(len(T_1_0)), 2):
+        for j, k in permutations(range(len(lost)), 2):
             loose = np.flatnonzero((owned[s] == j + 1) & lost[j] & lost[k])
             if not (firm[j].n and firm[k].n and len(loose)):
                 continue
@@ -242,6 +251,7 @@ def _pieces(
     if not bridges:
         gap = max(map(spacing, np.split(both, [len(rows[0])])))
         piece = _cut_at_hinge(both, piece, T_1_0, radius, gap, extent)
+        piece = _joined_across_pivot(both, piece, T_1_0)
     return rows, np.split(piece, [len(rows[0])])
 
 
@@ -266,3 +276,21 @@ def _cut_at_hinge(
     shared = min(a.max() for a in along) - max(a.min() for a in along)
     links = KDTree(first).count_neighbors(KDTree(second), 1.1 * gap)
     return cut if links * gap < LINKED * shared else piece
+
+
+def _joined_across_pivot(points: np.ndarray, piece: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """Pieces (n,) of points (n, 3), the two largest made one if a pivot between them joins them.
+
+    Where a blade of scissors crosses the other, that one hides it. Doors back to back are longer than far apart.
+    """
+    screw, size = matrix_to_screw(T), np.bincount(piece)
+    if screw.angle == 0 or len(size) < 2:
+        return piece
+    larger, smaller = np.argsort(-size, kind="stable")[:2]
+    first, second = points[piece == larger], points[piece == smaller]
+    distance, index = map(np.asarray, KDTree(first).query(second))
+    nearest = int(distance.argmin())
+    a, b = (np.cross(p - screw.pivot, screw.axis) for p in (first[index[nearest]], second[nearest]))
+    along = [side @ screw.axis for side in (first, second)]
+    shared = min(x.max() for x in along) - max(x.min() for x in along)
+    return np.where(piece == smaller, larger, piece) if a @ b < 0 < shared < distance[nearest] else piece

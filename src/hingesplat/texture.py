@@ -6,7 +6,7 @@ motion carries are laid on the photographs of both states, the motion is correct
 textures are compared (``patches``).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -94,36 +94,37 @@ def told_apart(
 def vouched_for(
     choices: Choices,
     prices: dict[int, float],
-    alike: Callable[[int, int, Pair], bool],
+    heeded: Callable[[int, Collection[int], Pair], bool],
     likeness: Callable[[int | None, Pair], np.ndarray],
     price: float,
     parts: int | None,
 ) -> dict[int, float]:
-    """Motions and their prices, with those like one of them that explain half a price and that texture vouches for.
+    """Motions and their prices, with others that explain this price and that texture vouches for, where it is heeded.
 
-    Two drawers pulled out by nearly the same are one to points and colours, or nearly so; but texture goes along with
-    the motion of its own alone. Elsewhere it does not buy a motion: handles of a kind go along with look-alikes, too.
+    Texture goes along with the motion of its own alone. Not everywhere is that proof of a part: handles of a kind go
+    along with look-alikes, too.
 
     Args:
         prices: the motions that there are for certain.
-        alike: whether two motions take these points, (n,) bool of each state, to nearly the same places.
+        heeded: whether texture's word counts for a motion, besides these, that owns such points, (n,) bool of each
+            state.
         likeness: correlations (m,) of patches of such points, moved so; None is to stay.
-        price: of each motion, in points.
+        price: of what texture vouches for, in points.
         parts: choose no more than this many.
     """
     kept = frozenset(prices)
     if parts is not None and len(kept) >= parts:
         return prices
     for k, gain in choices.gains(kept).items():
-        if gain <= LEAST * price + 1:  # Less would not be chosen for that.
+        if gain <= price + 1:  # Less would not be chosen for that.
             break
         more = sorted(kept | {k})
         first, second = choices.labels(more)
         mine = first == more.index(k) + 1, second == more.index(k) + 1
-        if not any(alike(j, k, mine) for j in kept) or not _goes_along(own := likeness(k, mine)):
+        if not heeded(k, kept, mine) or not _goes_along(own := likeness(k, mine)):
             continue
         if all((likeness(j, mine) > AGREED).sum() < OTHERWISE * len(own) for j in (None, *kept)):
-            return vouched_for(choices, {**prices, k: LEAST * price}, alike, likeness, price, parts)
+            return vouched_for(choices, {**prices, k: price}, heeded, likeness, price, parts)
     return prices
 
 
@@ -253,6 +254,11 @@ def against(found: Sequence[tuple[np.ndarray, float]]) -> float:
     return sum(COST * float((AGREED - likeness).sum()) * points for likeness, points in found)
 
 
+def likeness(found: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:
+    """(m,) the correlations of all patches that were ``compared``."""
+    return np.concatenate([correlations for correlations, _ in found])
+
+
 def _outward(points: np.ndarray, normals: np.ndarray, photographs: Sequence[Photograph], near: float) -> np.ndarray:
     """(n,) the sign with which normals (n, 3) face the cameras that see the points (n, 3)."""
     facing = np.zeros(len(points))
@@ -266,11 +272,13 @@ def _outward(points: np.ndarray, normals: np.ndarray, photographs: Sequence[Phot
 
 
 __all__ = [
+    "LEAST",
     "TextureConfig",
     "against",
     "carried",
     "compared",
     "fitted",
+    "likeness",
     "photographs_of",
     "told_apart",
     "vouched_for",
