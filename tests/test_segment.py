@@ -519,7 +519,7 @@ def test_texture_buys_a_motion_of_its_own_at_half_the_price() -> None:
 
 def test_what_is_nearly_right_is_heard_again_once_it_fits_what_would_be_its_own(monkeypatch) -> None:
     """A motion that is off by 7° explains less than half a price. Corrected it explains more, and texture goes along
-    with it; not with what was off, nor with handles, of which few patches of many have any."""
+    with it; not with what was off, and too little with handles, few patches of which do."""
     made, patches = made_scene("revolute"), [40]
 
     def compared(_surfaces: Any, _photographs: Any, T_1_0: np.ndarray, *_: Any) -> list[tuple[np.ndarray, float]]:

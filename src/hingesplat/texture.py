@@ -94,7 +94,7 @@ def told_apart(
 def vouched_for(
     choices: Choices,
     prices: dict[int, float],
-    heeded: Callable[[int, Collection[int], Pair], bool],
+    heeded: Callable[[int, float, Collection[int], Pair], bool],
     likeness: Callable[[int | None, Pair], np.ndarray],
     price: float,
     parts: int | None,
@@ -106,8 +106,8 @@ def vouched_for(
 
     Args:
         prices: the motions that there are for certain.
-        heeded: whether texture's word counts for a motion, besides these, that owns such points, (n,) bool of each
-            state.
+        heeded: whether texture's word counts for a motion that gains so many points besides these, and owns such, (n,)
+            bool of each state.
         likeness: correlations (m,) of patches of such points, moved so; None is to stay.
         price: of what texture vouches for, in points.
         parts: choose no more than this many.
@@ -121,7 +121,7 @@ def vouched_for(
         more = sorted(kept | {k})
         first, second = choices.labels(more)
         mine = first == more.index(k) + 1, second == more.index(k) + 1
-        if not heeded(k, kept, mine) or not _goes_along(own := likeness(k, mine)):
+        if not heeded(k, gain, kept, mine) or not _goes_along(own := likeness(k, mine)):
             continue
         if all((likeness(j, mine) > AGREED).sum() < OTHERWISE * len(own) for j in (None, *kept)):
             return vouched_for(choices, {**prices, k: price}, heeded, likeness, price, parts)
@@ -272,6 +272,7 @@ def _outward(points: np.ndarray, normals: np.ndarray, photographs: Sequence[Phot
 
 
 __all__ = [
+    "GOES_ALONG",
     "LEAST",
     "TextureConfig",
     "against",
