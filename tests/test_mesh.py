@@ -167,11 +167,12 @@ def test_parts_of_a_scene_in_two_states_come_back_apart_closed_and_coloured():
     assert meshes[1].volume < 0.8 * 0.8 * 0.16
 
 
-def test_a_sheet_seen_from_one_side_is_a_thin_solid_not_a_brick():
+@pytest.mark.parametrize("part", [0, 1])
+def test_a_sheet_seen_from_one_side_is_a_thin_solid_not_a_brick(part: int):
     rest = box_gaussians((0.8, 0.8, 0.8), (0, 0, 0), 0, 0.04)
-    front = (rest.means[:, 1] < -0.39).long()
+    front = (rest.means[:, 1] < -0.39).long() == part
     cameras = [c for c in sphere_of_cameras(40) if c.centre[1] < -0.5]
-    mesh = mesh_parts(rest.with_part(front), [(cameras, {})], MeshConfig(resolution=48, image_size=96))[1]
+    mesh = mesh_parts(rest.with_part(front.long()), [(cameras, {})], MeshConfig(resolution=48, image_size=96))[part]
     assert mesh.is_watertight
     assert mesh.extents[1] < 0.15
     assert mesh.extents[[0, 2]] == pytest.approx([0.8, 0.8], abs=0.1)
@@ -213,13 +214,15 @@ def test_a_drawer_under_a_painted_lid_is_hollow_where_stereo_sees_into_it_in_eit
     assert KDTree(surface).query(trimesh.sample.sample_surface(hollow, 5_000, seed=0)[0])[0].mean() < 0.01
 
 
-def test_a_block_is_solid_though_no_camera_sees_its_underside():
-    shape = trimesh.creation.box((0.8, 0.8, 0.5))
+@pytest.mark.parametrize("height", [0.5, 0.1])
+def test_a_block_is_solid_though_no_camera_sees_its_underside_and_that_is_flat(height: float):
+    shape = trimesh.creation.box((0.8, 0.8, height))
     cameras = [c for c in sphere_of_cameras(36) if c.centre[2] > 0.3]
     maps = [[known_depth(c, shape) for c in cameras]]
-    scene = box_gaussians((0.8, 0.8, 0.5), (0, 0, 0), 0)
+    scene = box_gaussians((0.8, 0.8, height), (0, 0, 0), 0)
     mesh = mesh_parts(scene, [(cameras, {})], MeshConfig(resolution=48, image_size=96), maps=maps)[0]
     assert mesh.is_watertight and mesh.volume == pytest.approx(shape.volume, rel=0.1)
+    assert mesh.bounds[0][2] == pytest.approx(-height / 2, abs=0.8 / 48)
 
 
 def test_what_is_unseen_in_the_depth_of_an_open_carcass_is_empty():

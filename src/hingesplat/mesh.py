@@ -29,6 +29,8 @@ from hingesplat.tsdf import DepthView, DistanceGrid, distance_to, fuse_depth, ta
 
 log = logging.getLogger(__name__)
 
+MOST = 0.5
+"""Share of a part that must lie within the convex hull of what was seen of it for that to be its bound."""
 HOLLOW = 0.2
 """An unseen pocket is empty where more than this share of what borders on it was seen to be."""
 
@@ -167,7 +169,7 @@ def _solids(
         guess = np.maximum(mover.distance, np.minimum(taken, 1))
         grids[i] = mover = replace(mover, distance=np.where(mover.weight > 0, mover.distance, guess))
         room = np.minimum(room, distance_to(base, mover, T_base_mover))
-    base = _filled(base, surfaces[0], config)
+    base = _filled(base, surfaces[0], config, bounded=True)
     taken = (config.clearance * base.voxel - room) / base.truncation
     grids[0] = replace(base, distance=np.maximum(base.distance, np.minimum(taken, 1)))
     return grids
@@ -181,11 +183,21 @@ def _fused_grid(views: list[DepthView], surface: np.ndarray, config: MeshConfig)
     return fuse_depth(views, lower, (nx, ny, nz), voxel, config.truncation * voxel)
 
 
-def _filled(grid: DistanceGrid, surface: np.ndarray, config: MeshConfig) -> DistanceGrid:
-    """The rule for the unseen, and a little smoothing."""
+def _filled(grid: DistanceGrid, surface: np.ndarray, config: MeshConfig, *, bounded: bool = False) -> DistanceGrid:
+    """The rule for the unseen, and a little smoothing.
+
+    If ``bounded``, nothing sticks out of the convex hull of what was seen: a bottom that no camera sees is flat between
+    its edges. The wall of a drawer of which only the inside was seen does stick out, and so does a sheet seen from one
+    side.
+    """
+    hull = _hull_distance(surface, grid.lower, grid.distance.shape, grid.voxel)
     unseen = grid.weight == 0
-    solid = _solid_unseen(grid.distance, unseen, surface, grid.lower, grid.voxel, _wall(surface, config))
+    solid = _solid_unseen(grid.distance, unseen, hull <= 1, surface, grid.lower, grid.voxel, _wall(surface, config))
     distance = np.where(unseen, np.where(solid, -1, 1), grid.distance).astype(np.float32)
+    if bounded:
+        within = np.maximum(distance, np.clip(hull * (grid.voxel / grid.truncation), -1, 1))
+        if (within < 0).sum() > MOST * (distance < 0).sum():
+            distance = within
     return replace(grid, distance=ndimage.gaussian_filter(distance, 0.7))
 
 
@@ -195,14 +207,19 @@ def _wall(surface: np.ndarray, config: MeshConfig) -> float:
 
 
 def _solid_unseen(
-    distance: np.ndarray, unseen: np.ndarray, surface: np.ndarray, lower: np.ndarray, voxel: float, reach: float
+    distance: np.ndarray,
+    unseen: np.ndarray,
+    hull: np.ndarray,
+    surface: np.ndarray,
+    lower: np.ndarray,
+    voxel: float,
+    reach: float,
 ) -> np.ndarray:
     """Which unseen voxels belong to the part: those of its walls, and pockets that these close.
 
     Walls are ``reach`` thick and stand on the surface (n, 3) and, as what it stands on is rarely photographed, on its
-    convex hull. A pocket between them is empty where it lies open towards space that was seen to be empty.
+    convex ``hull``. A pocket between them is empty where it lies open towards space that was seen to be empty.
     """
-    hull = _hull_grid(surface, lower, distance.shape, voxel)
     inside = unseen & hull
     index = np.argwhere(inside)
     away, _ = KDTree(surface).query(lower + voxel * index, distance_upper_bound=reach, workers=torch.get_num_threads())
@@ -339,27 +356,42 @@ def _ellipsoid_points(gaussians: Gaussians) -> np.ndarray:
     return torch.cat([centre + arms, centre - arms], 1).reshape(-1, 3).numpy()
 
 
-def _hull_grid(cloud: np.ndarray, lower: np.ndarray, shape: tuple[int, int, int], voxel: float) -> np.ndarray:
-    """``shape`` bool: voxels in the convex hull of a cloud, grown by one voxel; all if it has no hull.
+def _hull_distance(cloud: np.ndarray, lower: np.ndarray, shape: tuple[int, int, int], voxel: float) -> np.ndarray:
+    """``shape`` float32: how far, in voxels, the facets of a cloud's convex hull leave each voxel outside.
 
-    Each facet cuts every column of voxels at one height, so a column is an interval.
+    Exact up to three voxels either way, and infinite beyond; -inf everywhere if there is no hull.
     """
     try:
-        # Rounding to the grid first leaves few facets.
-        equations = ConvexHull(np.unique(np.round((cloud - lower) / voxel), axis=0)).equations
+        # Rounding first leaves few facets.
+        equations = ConvexHull(np.unique(np.round(4 * (cloud - lower) / voxel), axis=0) / 4).equations
     except QhullError:
-        return np.ones(shape, bool)
-    x, y = np.meshgrid(np.arange(shape[0]), np.arange(shape[1]), indexing="ij")
-    top, bottom = np.full(shape[:2], np.inf), np.full(shape[:2], -np.inf)
+        return np.full(shape, -np.inf, np.float32)
+    columns = np.stack(np.meshgrid(np.arange(shape[0]), np.arange(shape[1]), indexing="ij"), -1)
+    core, grown = (_within(equations + np.array([0, 0, 0, -margin]), columns, shape[2]) for margin in (-3, 3))
+    rim = np.argwhere(grown & ~core)
+    distance = np.where(core, -np.inf, np.inf).astype(np.float32)
+    nearest = np.full(len(rim), -np.inf)
+    for *normal, offset in equations:
+        np.maximum(nearest, rim @ np.array(normal) + offset, out=nearest)
+    distance[tuple(rim.T)] = nearest
+    return distance
+
+
+def _within(equations: np.ndarray, columns: np.ndarray, height: int) -> np.ndarray:
+    """Grid places where every ``a x + b y + c z + d`` of the equations (n, 4) is at most 0.
+
+    Each facet cuts a column (x, y) at one height, so that is an interval.
+    """
+    top, bottom = np.full(columns.shape[:2], np.inf), np.full(columns.shape[:2], -np.inf)
     for a, b, c, d in equations:
-        slack = 1 - (a * x + b * y + d)
+        slack = -(columns @ np.array([a, b]) + d)
         if c > 1e-9:
             top = np.minimum(top, slack / c)
         elif c < -1e-9:
             bottom = np.maximum(bottom, slack / c)
         else:
             top = np.where(slack < 0, -np.inf, top)
-    z = np.arange(shape[2])
+    z = np.arange(height)
     return (z >= bottom[..., None]) & (z <= top[..., None])
 
 

@@ -325,6 +325,8 @@ class _Case:
 
         What is off by 2 % of the extent explains a fifth of what it would if it were right. Texture has to go along.
         """
+        if self.parts is not None and len(chosen) >= self.parts:
+            return chosen
         price, kept, others = self.config.part_cost, frozenset(range(len(chosen))), list(candidates)
         for share in HEARD:
             motions = [*chosen, *others]
@@ -339,8 +341,8 @@ class _Case:
 
         def worth(k: int, gain: float, _: Collection[int], mine: Pair) -> bool:
             asked = sum(min(int(m.sum()), self.config.texture.patches) for m in mine)
-            along = (likeness(texture(k, mine)) > GOES_ALONG).sum()
-            return gain > price * (1 - DISCOUNT * along / asked)
+            along = int((likeness(texture(k, mine)) > GOES_ALONG).sum())
+            return gain > price * (1 - DISCOUNT * along / max(asked, 1))
 
         prices = vouched_for(
             Choices(self.problem, ways),
