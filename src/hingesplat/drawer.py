@@ -51,7 +51,7 @@ def insides(T_1_0: Sequence[np.ndarray], owned: Labels, surfaces: tuple[Surface,
     """
     labels = (owned[0].copy(), owned[1].copy())
     for k, T in enumerate(T_1_0, 1):
-        axis = _slide([T])
+        axis = slide_of([T])
         if axis is None:
             continue
         mine = np.concatenate([moved(surfaces[0].points[owned[0] == k], T), surfaces[1].points[owned[1] == k]])
@@ -88,7 +88,7 @@ def drawn_out(
         walls: how thick the part's and the base's walls count where nobody saw them, scene units.
     """
     own, wall = walls
-    axis = _slide(T_base_part)
+    axis = slide_of(T_base_part)
     if axis is None:
         return part
     ways, front = np.array([T[:3, 3] for T in T_base_part]), _largest(surface, 2 * own)
@@ -119,7 +119,7 @@ def drawn_out(
     return part
 
 
-def _slide(T_base_part: Sequence[np.ndarray]) -> np.ndarray | None:
+def slide_of(T_base_part: Sequence[np.ndarray]) -> np.ndarray | None:
     """(3,) the direction of a part that only slides, given places (4, 4) on its way."""
     turns, ways = np.array([T[:3, :3] for T in T_base_part]), np.array([T[:3, 3] for T in T_base_part])
     length = np.linalg.norm(ways, axis=-1)

@@ -20,7 +20,7 @@ from skimage.measure import marching_cubes
 from trimesh.visual import ColorVisuals
 
 from hingesplat.camera import Camera
-from hingesplat.drawer import drawn_out
+from hingesplat.drawer import drawn_out, slide_of
 from hingesplat.gaussians import SH_C0, Gaussians, posed
 from hingesplat.render import rasterize
 from hingesplat.se3 import wxyz_to_matrix
@@ -162,7 +162,7 @@ def _solids(
     room = np.full(base.distance.shape, np.inf, np.float32)
     for i in grids.keys() - {0}:
         T_base_mover = [p.get(i, np.eye(4)) for p in poses]
-        mover = _filled(grids[i], surfaces[i], config)
+        mover = _filled(grids[i], surfaces[i], config, bounded=slide_of(T_base_mover) is None)
         walls = _wall(surfaces[i], config), _wall(surfaces[0], config)
         mover = drawn_out(mover, surfaces[i], surfaces[0], T_base_mover, walls)
         taken = -distance_to(mover, known, [np.linalg.inv(T) for T in T_base_mover]) / mover.truncation
