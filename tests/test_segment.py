@@ -11,7 +11,17 @@ import pytest
 
 from hingesplat.gaussians import concatenate, posed
 from hingesplat.hypotheses import PATCH, HypothesesConfig, axis_directions, distinct, edges, groups_to_try, registered
-from hingesplat.labelling import Choices, Labelling, gone, label_costs, neighbour_weights, seed_costs, shortest, softmax
+from hingesplat.labelling import (
+    Choices,
+    Labelling,
+    gone,
+    label_costs,
+    meeting,
+    neighbour_weights,
+    seed_costs,
+    shortest,
+    softmax,
+)
 from hingesplat.pieces import follow_fronts, give_way, reattach_fragments, seen_to_move, split_pieces
 from hingesplat.render import render
 from hingesplat.screw import prismatic, revolute
@@ -546,13 +556,13 @@ def test_a_part_meets_itself_and_what_merely_hides_does_not(turned: Turned) -> N
     problem = Labelling.of(surfaces, extent)
     part = [parts_of(made, surface, s) for s, surface in enumerate(surfaces)]
     elsewhere = prismatic(FORWARD, -0.5 * extent)
-    assert problem.meeting([TURN.T], (part[0], part[1]))[0] > 0.8
-    assert problem.meeting([elsewhere], (part[0], part[1]))[0] < 0.3
+    assert meeting(problem.partners([TURN.T]), (part[0], part[1]))[0] > 0.8
+    assert meeting(problem.partners([elsewhere]), (part[0], part[1]))[0] < 0.3
     # What one state hides of a part has no partner; what it shows has.
     few = np.where(np.arange(len(part[0])) % 5, 0, part[0])
-    assert problem.meeting([TURN.T], (few, part[1]))[0] > 0.8
-    assert problem.meeting([TURN.T], (0 * part[0], 0 * part[1]))[0] == 0
-    assert problem.meeting([], (0 * part[0], 0 * part[1])).shape == (0,)
+    assert meeting(problem.partners([TURN.T]), (few, part[1]))[0] > 0.8
+    assert meeting(problem.partners([TURN.T]), (0 * part[0], 0 * part[1]))[0] == 0
+    assert meeting(problem.partners([]), (0 * part[0], 0 * part[1])).shape == (0,)
 
 
 @pytest.mark.parametrize("kind", ["revolute", "prismatic"])

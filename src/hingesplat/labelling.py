@@ -178,21 +178,6 @@ class Labelling:
         """Labels of both states' points under these motions, all of which stay."""
         return self.mean_field(self.costs(T_1_0), self.partners(T_1_0))[0]
 
-    def meeting(self, T_1_0: Sequence[np.ndarray], owned: Labels) -> np.ndarray:
-        """(motions,) share of each motion's points that meet one of its own, in that state where more of them do.
-
-        Of a part that one state shows nearly whole or hardly at all, that is nearly all of what the one or the other
-        shows: in 120 parts 0.76 at least. What merely hides had 0.4 and less.
-        """
-        partners = self.partners(T_1_0)
-        result = np.zeros(len(T_1_0))
-        for k in range(len(T_1_0)):
-            for s in (0, 1):
-                met = partners[s][owned[s] == k + 1, k + 1]
-                if len(met):
-                    result[k] = max(result[k], ((met >= 0) & (owned[1 - s][met] == k + 1)).mean())
-        return result
-
     def alone(self, T_1_0: Sequence[np.ndarray]) -> np.ndarray:
         """(motions,) share of each motion's points that neither another of them nor to stay explains nearly as well."""
         costs = self.costs(T_1_0)
@@ -203,6 +188,24 @@ class Labelling:
             worse = np.delete(own, k + 1, 1).min(1) - own[:, k + 1]
             result[k] = (worse > NEARLY).mean() if len(own) else 0
         return result
+
+
+def meeting(partners: Sequence[np.ndarray], owned: Labels) -> np.ndarray:
+    """(motions,) share of each motion's points that meet one of its own, in that state where more of them do.
+
+    Of a part that one state shows nearly whole or hardly at all, that is nearly all of what the one or the other shows:
+    in 120 parts 0.76 at least. What merely hides had 0.4 and less.
+
+    Args:
+        partners: as ``Labelling.partners`` gives them, of both states.
+    """
+    result = np.zeros(partners[0].shape[1] - 1)
+    for k in range(len(result)):
+        for s in (0, 1):
+            met = partners[s][owned[s] == k + 1, k + 1]
+            if len(met):
+                result[k] = max(result[k], ((met >= 0) & (owned[1 - s][met] == k + 1)).mean())
+    return result
 
 
 class Choices:

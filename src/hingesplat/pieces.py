@@ -272,8 +272,7 @@ def _cut_at_hinge(
     if len(size) < 2:
         return piece
     first, second = (points[cut == p] for p in np.argsort(-size, kind="stable")[:2])
-    along = [side @ screw.axis for side in (first, second)]
-    shared = min(a.max() for a in along) - max(a.min() for a in along)
+    shared = _shared_length(first, second, screw.axis)
     links = KDTree(first).count_neighbors(KDTree(second), 1.1 * gap)
     return cut if links * gap < LINKED * shared else piece
 
@@ -291,6 +290,11 @@ def _joined_across_pivot(points: np.ndarray, piece: np.ndarray, T: np.ndarray) -
     distance, index = map(np.asarray, KDTree(first).query(second))
     nearest = int(distance.argmin())
     a, b = (np.cross(p - screw.pivot, screw.axis) for p in (first[index[nearest]], second[nearest]))
-    along = [side @ screw.axis for side in (first, second)]
-    shared = min(x.max() for x in along) - max(x.min() for x in along)
+    shared = _shared_length(first, second, screw.axis)
     return np.where(piece == smaller, larger, piece) if a @ b < 0 < shared < distance[nearest] else piece
+
+
+def _shared_length(first: np.ndarray, second: np.ndarray, axis: np.ndarray) -> float:
+    """How far two sets of points (n, 3), (m, 3) go beside each other along an axis; negative where they do not."""
+    along = [side @ axis for side in (first, second)]
+    return float(min(a.max() for a in along) - max(a.min() for a in along))

@@ -26,7 +26,7 @@ from hingesplat.hypotheses import (
     propose_hanging,
     refit,
 )
-from hingesplat.labelling import Choices, Labelling, seed_costs
+from hingesplat.labelling import Choices, Labelling, meeting, seed_costs
 from hingesplat.patches import Photograph
 from hingesplat.pieces import (
     follow_fronts,
@@ -291,10 +291,14 @@ class _Case:
     ) -> Callable[[int | None, Pair], list[tuple[np.ndarray, float]]]:
         """``compared`` for the points of a motion, under any of the motions (4, 4), or None: to stay."""
         surfaces, extent = self.problem.surfaces, self.evidence.extent
+        said: dict[tuple[int | None, bytes, bytes], list[tuple[np.ndarray, float]]] = {}
 
         def texture(k: int | None, mine: Pair) -> list[tuple[np.ndarray, float]]:
-            T_1_0 = BASE if k is None else ways[k]
-            return compared(surfaces, photographs, T_1_0, mine, extent, self.config.texture, seed)
+            asked = k, mine[0].tobytes(), mine[1].tobytes()
+            if asked not in said:  # The same is asked more than once, and takes a while to say.
+                T_1_0 = BASE if k is None else ways[k]
+                said[asked] = compared(surfaces, photographs, T_1_0, mine, extent, self.config.texture, seed)
+            return said[asked]
 
         return texture
 
@@ -405,8 +409,9 @@ def _labelled(
     problem = Labelling.of(surfaces, extent)
     while True:
         transforms = [m.T for m in motions]
-        owned = problem.labels(transforms)
-        met = problem.meeting(transforms, owned)
+        partners = problem.partners(transforms)
+        owned = problem.mean_field(problem.costs(transforms), partners)[0]
+        met = meeting(partners, owned)
         if met.min(initial=1) >= MEETING:
             break
         worst = int(met.argmin())
