@@ -22,7 +22,7 @@ from hingesplat.labelling import (
     shortest,
     softmax,
 )
-from hingesplat.pieces import follow_fronts, give_way, reattach_fragments, seen_to_move, split_pieces
+from hingesplat.pieces import follow_fronts, give_way, passed_on, reattach_fragments, seen_to_move, split_pieces
 from hingesplat.render import render
 from hingesplat.screw import prismatic, revolute
 from hingesplat.se3 import moved
@@ -813,6 +813,19 @@ def test_the_back_of_a_plate_follows_its_front(thick: float, label: int) -> None
     given = np.repeat([0, 1, 2, 1], [400, 225, 225, 225])
     for found in follow_fronts((given, given), (plain(points), plain(points)), 1.0, (told, told)):
         np.testing.assert_array_equal(found, np.repeat([0, 1, 2, label], [400, 225, 225, 225]))
+
+
+def test_a_part_is_not_passed_on_from_one_to_another() -> None:
+    """Doors that look alike inside, one open in each state: the inside of one was a part that went to the other."""
+    doors = [patch((x, 0, 0.5), 15) for x in (-0.5, 0.5)]
+    insides = [door - (0, 0, 0.03) for door in doors]
+    given = np.repeat([0, 1, 2, 3], [400, 225, 225, 225])
+    first, second, apart = (
+        plain(np.concatenate([BASE, *doors, inside])) for inside in (*insides, doors[0] + (0.2, 0, 0))
+    )
+    np.testing.assert_array_equal(passed_on((given, given), (first, second), 1.0), [0, 0, 1])
+    for others in ((first, first), (first, apart)):  # A lever stays on its door, and may swing away from it.
+        np.testing.assert_array_equal(passed_on((given, given), others, 1.0), [0, 0, 0])
 
 
 def test_what_is_left_without_points_in_one_state_is_no_part(monkeypatch) -> None:

@@ -215,6 +215,23 @@ def follow_fronts(owned: Labels, surfaces: tuple[Surface, Surface], extent: floa
     return labels
 
 
+def passed_on(owned: Labels, surfaces: tuple[Surface, Surface], extent: float) -> np.ndarray:
+    """(parts,) share of each part's points that lie on one other part in state 0, and on another in state 1; the less.
+
+    Nobody hands a part over. Of two doors that look alike inside, one open in each state, the inside of one is taken
+    for that of the other: 0.98, where no part of 60 objects had more than 0.3.
+    """
+    parts = max(int(o.max(initial=0)) for o in owned)
+    share = np.zeros((2, parts, parts))
+    for s in (0, 1):
+        trees = [KDTree(surfaces[s].points[owned[s] == k + 1]) for k in range(parts)]
+        for k, j in permutations(range(parts), 2):
+            if trees[k].n and trees[j].n:
+                share[s, k, j] = (trees[j].query(trees[k].data)[0] < PLATE * extent).mean()
+    less = np.minimum(share[0][:, :, None], share[1][:, None, :])
+    return np.where(np.eye(parts, dtype=bool), 0, less).max((1, 2), initial=0)
+
+
 def seen_to_move(
     motions: Sequence[Motion], owned: Labels, surfaces: tuple[Surface, Surface], min_points: int
 ) -> tuple[list[Motion], Labels]:

@@ -31,6 +31,7 @@ from hingesplat.patches import Photograph
 from hingesplat.pieces import (
     follow_fronts,
     give_way,
+    passed_on,
     reattach_fragments,
     seen_to_move,
     split_pieces,
@@ -67,6 +68,9 @@ DISCOUNT = 2.5
 10 % of those of handles that were alike."""
 MEETING = 0.5
 """Share of a part's points that must meet its points of the other state, in one of the states."""
+
+PASSED_ON = 0.8
+"""Share of a part's points that lie on one part in state 0 and on another in state 1, from which it is none."""
 
 
 @dataclass(frozen=True)
@@ -411,10 +415,10 @@ def _labelled(
         transforms = [m.T for m in motions]
         partners = problem.partners(transforms)
         owned = problem.mean_field(problem.costs(transforms), partners)[0]
-        met = meeting(partners, owned)
-        if met.min(initial=1) >= MEETING:
+        doubt = np.maximum(MEETING - meeting(partners, owned), passed_on(owned, surfaces, extent) - PASSED_ON)
+        if doubt.max(initial=0) <= 0:
             break
-        worst = int(met.argmin())
+        worst = int(doubt.argmax())
         motions = motions[:worst] + motions[worst + 1 :]
     pieces = split_pieces(motions, owned, surfaces, extent, config.min_part_seeds)
     if parts is None or len(pieces[0]) <= parts:
