@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from hingesplat.align import AlignConfig, align
 from hingesplat.articulate import ArticulateConfig, articulate
 from hingesplat.fit import FitConfig, fit
 from hingesplat.gaussians import Gaussians
@@ -22,7 +23,7 @@ from standin import definition_as_gsplat, standin, waits
 
 MADE = scene("revolute", 32, 0.12)
 CLOUD = Cloud.of(MADE.gaussians.means.numpy())
-FEW = ArticulateConfig(steps=4, align_steps=2, densify_every=100)
+FEW = ArticulateConfig(steps=4, pose_rate=2e-3, densify_every=100)
 EVERYTHING = {
     "found before": FEW,
     "the paper's": ArticulateConfig(
@@ -65,6 +66,13 @@ def articulated(config: ArticulateConfig, where: str) -> tuple[Gaussians, np.nda
     return found.gaussians, found.T_state_0
 
 
+def aligned(steps: int, where: str) -> np.ndarray:
+    labels, off = MADE.gaussians.part.numpy(), MADE.T_state_0.copy()
+    off[1, 1, :3, 3] += 0.02
+    pair = MADE.gaussians, MADE.at(1)
+    return align(pair, (labels, labels), 1, off, MADE.views, AlignConfig(steps=steps), device=where)
+
+
 def with_joints(steps: int, where: str) -> tuple[Gaussians, np.ndarray]:
     offsets = torch.zeros((2, len(MADE.gaussians), 3))
     config = JointsConfig(steps=steps, type_steps=2, uncertainty_views=2)
@@ -103,6 +111,10 @@ def test_joint_optimisation_is_the_same(device: str, name: str) -> None:
     np.testing.assert_allclose(T, T_expected, atol=5e-3)
 
 
+def test_an_alignment_is_the_same(device: str) -> None:
+    np.testing.assert_allclose(aligned(4, device), aligned(4, "cpu"), atol=5e-3)
+
+
 def test_joints_are_the_same(device: str) -> None:
     (found, joint), (expected, joint_expected) = (with_joints(4, where) for where in (device, "cpu"))
     assert_alike(found, expected)
@@ -110,7 +122,8 @@ def test_joints_are_the_same(device: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "run", [fitted, lambda n, where: articulated(ArticulateConfig(steps=n, align_steps=n), where), with_joints]
+    "run",
+    [fitted, aligned, lambda n, where: articulated(ArticulateConfig(steps=n, pose_rate=2e-3), where), with_joints],
 )
 @pytest.mark.parametrize("device", ["standin"], indirect=True)
 def test_no_step_waits_for_the_device(device: str, run: Callable[[int, str], object]) -> None:

@@ -145,6 +145,7 @@ def test_methods_come_from_fits_to_motions(method, run: Run) -> None:
     start = load_file(run / "segmentation.safetensors")
     assert start["T_state_0"].shape == (2, 3, 4, 4)
     assert bool(start["labels_0"].any()) == (method == "artgs")
+    pipeline._align(run)
     pipeline._fuse(run)
     pipeline._articulate(run)
     moved = load_file(run / "articulation.safetensors")
@@ -161,7 +162,7 @@ def test_displacements_without_parts_find_a_slide_that_is_plain(run: Run) -> Non
     config = replace(configure("vanilla"), parts=2)
     articulate = replace(config.articulate, steps=1)
     run = replace(run, config=replace(config, articulate=articulate))
-    for stage in (pipeline._segment, pipeline._fuse, pipeline._articulate):
+    for stage in (pipeline._segment, pipeline._align, pipeline._fuse, pipeline._articulate):
         stage(run)
     T = load_file(run / "articulation.safetensors")["T_state_0"].numpy()
     np.testing.assert_allclose(T[1, 1, :3, 3], [0, -0.03, 0], atol=0.01)

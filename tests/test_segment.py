@@ -551,6 +551,21 @@ def test_what_is_nearly_right_is_heard_again_once_it_fits_what_would_be_its_own(
     assert case.heard_again([], [off], [[], []], 0) == []
 
 
+@pytest.mark.parametrize(("along", "still", "kept"), [(0, 5, 0), (0, 4, 1), (6, 5, 1)])
+def test_what_texture_says_has_stayed_has_not_moved(monkeypatch, along: int, still: int, kept: int) -> None:
+    """A wall beside a hinge, in whose place shadows made stereo see nothing, was a part of its own."""
+    made = made_scene("revolute")
+
+    def compared(_surfaces: Any, _photographs: Any, T_1_0: np.ndarray, *_: Any) -> list[tuple[np.ndarray, float]]:
+        return [(np.full(still if np.array_equal(T_1_0, np.eye(4)) else along, 0.95), 1.0)]
+
+    monkeypatch.setattr("hingesplat.segment.compared", compared)
+    low, high, surfaces = survey((made.gaussians, made.at(1)), made.views, ((), ()), CONFIG)
+    evidence, (first, second) = gather(surfaces, low, high, CONFIG, np.random.default_rng(0))
+    case = _Case.of(evidence, (first, second), CONFIG, None)
+    assert case.without_still([TURN], [[], []], 0) == [TURN][:kept]
+
+
 def test_a_part_meets_itself_and_what_merely_hides_does_not(turned: Turned) -> None:
     made, surfaces, extent = turned
     problem = Labelling.of(surfaces, extent)

@@ -6,7 +6,6 @@ from typing import Literal
 
 import numpy as np
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from hingesplat.capture import View
@@ -18,24 +17,13 @@ from hingesplat.physics import PhysicsConfig, RepelConfig, Repulsion, Targets, o
 from hingesplat.poses import (
     PoseDelta,
     StateLossConfig,
-    errors_by_part,
-    move_parts_alone,
     part_centres,
     pose_step,
     state_loss,
 )
 from hingesplat.slots import SlotsConfig, living_slots
 from hingesplat.stereo import DepthMap
-from hingesplat.training import Report, TrainingView, averaged, grow, shuffled, thinned, training_views
-
-JUDGES, BETTER = 25, 0.9
-"""Photographs of a state that say whether an alignment has made things better, and the share of the error that may be
-left if it plainly has: a round lever 13° off had 0.65."""
-GENTLER = 4
-"""Part of the rate at which all is tried once more if a part went back."""
-ASTRAY, FAR = 5e-3, 0.03
-"""Extents by which an alignment that is not plainly better may take a part off the other state's surface, in the mean:
-a door brought from 11° off to 1° had 0.003, one that left its hinge 0.009. No point counts as farther off than FAR."""
+from hingesplat.training import Report, averaged, grow, shuffled, training_views
 
 
 @dataclass(frozen=True)
@@ -46,12 +34,9 @@ class ArticulateConfig:
     """Optimiser steps, each on one photograph of one state."""
     max_gaussians: int = 16_000
     """Cap on the number of canonical Gaussians."""
-    align_steps: int = 240
-    """Steps before these in which parts move and nothing else changes, from a start that was searched for."""
-    align_rate: float = 1e-2
-    """Adam step of their poses then (radians, extents); decays to 10 %."""
-    pose_rate: float = 2e-3
-    """Adam step of the part poses (radians, extents) at the start; decays to 2 %."""
+    pose_rate: float = 2e-4
+    """Adam step of the part poses (radians, extents) at the start; decays to 2 %. Small where alignment came before:
+    what one state alone shows of a part holds it, and what is painted follows."""
     render: StateLossConfig = field(default_factory=StateLossConfig)
     densify_every: int = 150
     """Steps between densifications."""
@@ -102,7 +87,7 @@ def articulate(
         views: training photographs of every state.
         fitted: each state's own Gaussians; L_art, L_vector and displacements without parts need them.
         maps: the depth of every photograph where it is known.
-        known: (movers,) bool, which first motions need no alignment; none if it is left out.
+        known: (movers,) bool, which first motions are right as they are; none if it is left out.
         device: where to optimise; what comes out is on the CPU.
     """
     rng = np.random.default_rng(seed)
@@ -113,6 +98,8 @@ def articulate(
     centres = part_centres(canonical, parts)
     first = config.frame == "first"
     poses = PoseDelta(torch.from_numpy(T_state_0).to(canonical.means), centres, extent, first_is_frame=first)
+    if known is not None:
+        poses.free[:, 1:][:, torch.from_numpy(known).to(device)] = 0
     pose_adam = torch.optim.Adam(poses.parameters, lr=config.pose_rate)
     rate = config.rates.means * extent
     identity = identity_of(canonical, parts, fitted, config.identity, extent, rate, generator)
@@ -121,10 +108,6 @@ def articulate(
     extra = {"state_sh": (canonical.means.new_zeros((len(canonical), len(views) - 1, 3)), config.rates.sh)}
     optimiser = GaussianAdam(canonical, config.rates, extent, extra | identity.extra | targets.extra)
     training = training_views(views, maps, device)
-    if first and config.identity.kind == "hard" and config.align_steps:
-        free = np.ones(parts - 1, bool) if known is None else ~known
-        if free.any():
-            _align(canonical, poses, free, training, fitted, extent, config, rng)
     photographs = shuffled(training, rng)
     statistics = optimiser.fresh_statistics()
     tell = averaged(report, config.steps)
@@ -153,67 +136,6 @@ def articulate(
             targets.stale()
         tell(loss, error, len(optimiser))
     return _result(optimiser, poses, identity, extent, config, seed)
-
-
-def _align(
-    canonical: Gaussians,
-    poses: PoseDelta,
-    free: np.ndarray,
-    training: Sequence[Sequence[TrainingView]],
-    fitted: Sequence[Gaussians],
-    extent: float,
-    config: ArticulateConfig,
-    rng: np.random.Generator,
-) -> None:
-    """Move the parts that are ``free`` (movers,) alone, before anything is painted anew.
-
-    What the shape of a part leaves open (a round bar turned about itself) its texture tells, as long as Gaussians have
-    not taken on the colours of a wrong pose. A part goes back to where it was if photographs do not like it better, or
-    hardly so and its surface comes off that of the ``fitted`` Gaussians: the insides of a door, unseen so far, draw it.
-    (A door that texture had put right, they drew off by 4°, and photographs liked that: its error fell to 0.65.) Then
-    there is a second, gentler try.
-    """
-    for rate in (config.align_rate, config.align_rate / GENTLER):
-        were = [correction.detach().clone() for correction in poses.parameters]
-        (R, t), off = poses.Rt(), _misfits(canonical, poses, fitted, extent)
-        move_parts_alone(canonical, poses, training, config.align_steps, rate, config.render.ssim_weight, rng, end=0.1)
-        before, after = _mean_errors(canonical, [(R, t), poses.Rt()], thinned(training, JUDGES))
-        still_on = _misfits(canonical, poses, fitted, extent) < off + ASTRAY
-        good = free & ((after < BETTER * before) | ((after < before) & still_on))
-        with torch.no_grad():
-            for correction, was in zip(poses.parameters, were, strict=True):
-                kept = torch.from_numpy(good).to(correction.device)[:, None]
-                correction[:, 1:] = torch.where(kept, correction[:, 1:], was[:, 1:])
-        if good[free].all():
-            break
-
-
-def _mean_errors(
-    g: Gaussians, trials: Sequence[tuple[Tensor, Tensor]], training: Sequence[Sequence[TrainingView]]
-) -> np.ndarray:
-    """(trials, movers) mean of ``errors_by_part`` over the photographs that show each; infinite where none does."""
-    errors = errors_by_part(g, trials, training)
-    seen = np.isfinite(errors)
-    return np.where(seen.any(1), np.where(seen, errors, 0).sum(1) / np.maximum(seen.sum(1), 1), np.inf)
-
-
-@torch.no_grad()
-def _misfits(g: Gaussians, poses: PoseDelta, fitted: Sequence[Gaussians], extent: float) -> np.ndarray:
-    """(movers,) mean distance, in extents, of each part's Gaussians from the nearest of every moved state's own.
-
-    Zero where a part has none. Infinite if no state has been fitted.
-    """
-    g, (R, t) = g.to("cpu"), (x.cpu() for x in poses.Rt())
-    total = np.zeros(R.shape[1] - 1) if fitted else np.full(R.shape[1] - 1, np.inf)
-    g = g[g.opacities > 0.5]
-    for state, own in list(enumerate(fitted))[1:]:
-        tree = KDTree(own.means[own.opacities > 0.5].numpy())
-        for k in range(1, R.shape[1]):
-            moved = g.means[g.part == k] @ R[state, k].T + t[state, k]
-            if len(moved):
-                distance = np.asarray(tree.query(moved.numpy(), workers=torch.get_num_threads())[0])
-                total[k - 1] += np.minimum(distance / extent, FAR).mean() / (len(fitted) - 1)
-    return total
 
 
 def _result(

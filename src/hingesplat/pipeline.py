@@ -10,7 +10,7 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -24,6 +24,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
+from hingesplat.align import AlignConfig, align, shown_movers
 from hingesplat.articulate import ArticulateConfig, Articulation, articulate
 from hingesplat.camera import common_up
 from hingesplat.capture import Capture, View
@@ -96,6 +97,7 @@ class ReconstructConfig:
     fit: FitConfig = field(default_factory=FitConfig)
     segment: SegmentConfig = field(default_factory=SegmentConfig)
     start: StartConfig = field(default_factory=StartConfig)
+    align: AlignConfig = field(default_factory=AlignConfig)
     fuse: FuseConfig = field(default_factory=FuseConfig)
     articulate: ArticulateConfig = field(default_factory=ArticulateConfig)
     joints: JointsConfig = field(default_factory=JointsConfig)
@@ -369,16 +371,41 @@ def _write_start(
     write_tensors(run / "segmentation.safetensors", found)
 
 
-def _fuse(run: Run) -> None:
+def _align(run: Run) -> None:
     found = load_file(run / "segmentation.safetensors")
     T_state_0, other = found["T_state_0"].numpy(), int(found["other"])
-    if T_state_0.shape[1] == 1:  # Nothing moved: the first state is all there is.
+    kept = {f"kept_{s}": torch.ones_like(found[f"labels_{s}"], dtype=torch.bool) for s in (0, 1)}
+    if T_state_0.shape[1] > 1 and run.config.start.motions == "search":
+        config = run.config.align
+        for s, t in enumerate((0, other)):
+            labels = found[f"labels_{s}"].numpy()
+            kept[f"kept_{s}"] = torch.from_numpy(shown_movers(_fitted(run, t), labels, run.views[t], config.shown))
+        pair, labels, _ = _pair(run, found | kept)
+        T_state_0 = align(
+            pair, labels, other, T_state_0, run.views, config,
+            known=found["known"].numpy(), seed=run.config.seed, device=run.device,
+        )  # fmt: skip
+    write_tensors(run / "alignment.safetensors", {"T_state_0": torch.from_numpy(T_state_0)} | kept)
+
+
+def _fuse(run: Run) -> None:
+    aligned = load_file(run / "alignment.safetensors")
+    if aligned["T_state_0"].shape[1] == 1:  # Nothing moved: the first state is all there is.
         canonical = _fitted(run, 0)
     else:
-        labels = (found["labels_0"].numpy(), found["labels_1"].numpy())
-        pair = (_fitted(run, 0), _fitted(run, other))
-        canonical = fuse(pair, labels, T_state_0[other], run.config.fuse, seed=run.config.seed)
+        pair, labels, other = _pair(run, load_file(run / "segmentation.safetensors") | aligned)
+        T_1_0 = aligned["T_state_0"][other].numpy()
+        canonical = fuse(pair, labels, T_1_0, run.config.fuse, seed=run.config.seed)
     canonical.save(run / "canonical.safetensors")
+
+
+def _pair(
+    run: Run, found: Mapping[str, Tensor]
+) -> tuple[tuple[Gaussians, Gaussians], tuple[np.ndarray, np.ndarray], int]:
+    """The kept Gaussians of state 0 and of the other state of the search, their labels, and which state that is."""
+    other = int(found["other"])
+    (first, second), (a, b) = (_fitted(run, 0), _fitted(run, other)), (found["kept_0"], found["kept_1"])
+    return (first[a], second[b]), (found["labels_0"][a].numpy(), found["labels_1"][b].numpy()), other
 
 
 def initial_transforms(T_1_0: np.ndarray, states: int) -> np.ndarray:
@@ -395,13 +422,12 @@ def initial_transforms(T_1_0: np.ndarray, states: int) -> np.ndarray:
 def _articulate(run: Run) -> None:
     canonical = Gaussians.load(run / "canonical.safetensors")
     start = load_file(run / "segmentation.safetensors")
-    T_state_0 = start["T_state_0"].numpy()
+    T_state_0 = load_file(run / "alignment.safetensors")["T_state_0"].numpy()
     moved = Articulation(canonical, T_state_0, torch.zeros(len(T_state_0), len(canonical), 3))
     if T_state_0.shape[1] > 1:
         moved = articulate(
             canonical, T_state_0, run.views, run.config.articulate,
-            fitted=[_fitted(run, t) for t in range(len(T_state_0))], maps=_depths(run),
-            known=start["known"].numpy() if "known" in start else None,
+            fitted=[_fitted(run, t) for t in range(len(T_state_0))], maps=_depths(run), known=start["known"].numpy(),
             seed=run.config.seed, device=run.device, report=run.reporting("articulate"),
         )  # fmt: skip
     extra = {"T_state_0": torch.from_numpy(np.asarray(moved.T_state_0)), "state_sh": moved.state_sh}
@@ -482,6 +508,7 @@ STAGES: dict[str, Callable[[Run], None]] = {
     "stereo": _stereo,
     "fit": _fit,
     "segment": _segment,
+    "align": _align,
     "fuse": _fuse,
     "articulate": _articulate,
     "joints": _joints,
@@ -493,6 +520,7 @@ INHERITED: dict[str, tuple[tuple[str, ...], str]] = {
     "stereo": (("photographs", "stereo", "depth", "max_size"), "depth_state*.safetensors"),
     "fit": (("fit", "seed"), "fit_state*.safetensors"),
     "segment": (("segment", "start", "parts", "articulate.slots"), "segmentation.*"),
+    "align": (("align",), "alignment.safetensors"),
     "fuse": (("fuse",), "canonical.safetensors"),
     "articulate": (("articulate",), "articulation.safetensors"),
 }

@@ -243,7 +243,7 @@ def cells(rows: Sequence[Row]) -> dict[str, str]:
         "seconds": spread(seconds("total"), 0),
         "fit s": spread(seconds("stereo", "fit"), 0),
         "segment s": spread(seconds("segment"), 0),
-        "joint s": spread(seconds("fuse", "articulate", "joints"), 0),
+        "joint s": spread(seconds("align", "fuse", "articulate", "joints"), 0),
         "rest s": spread(seconds("mesh", "export", "pictures"), 0),
         "MB": spread([r["summary"]["peak_memory_mb"] for r in good], 0),
         "given": given(rows),

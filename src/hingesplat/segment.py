@@ -42,6 +42,7 @@ from hingesplat.search import BASE, Motion, ScoreVolume, carrier_of, inverted, n
 from hingesplat.stereo import DepthMap
 from hingesplat.surface import Labels, Pair, Surface, bounds, surface_of, thin
 from hingesplat.texture import (
+    ENOUGH,
     GOES_ALONG,
     LEAST,
     TextureConfig,
@@ -56,7 +57,7 @@ from hingesplat.texture import (
 from hingesplat.training import evenly
 from hingesplat.visibility import FREE, HIDDEN, ask
 
-ALONE = 0.5
+ALONE = 0.8
 """Share of a hanging part's points that nothing else may explain nearly as well; else they are those of a door whose
 motion is a little off."""
 ALIKE = 0.06
@@ -69,7 +70,7 @@ DISCOUNT = 2.5
 MEETING = 0.5
 """Share of a part's points that must meet its points of the other state, in one of the states."""
 
-PASSED_ON = 0.8
+PASSED_ON = 0.6
 """Share of a part's points that lie on one part in state 0 and on another in state 1, from which it is none."""
 
 
@@ -213,6 +214,7 @@ def segment(
     prices = case.told_by_texture([m.T for m in candidates], photographs, seed)
     chosen = case.settled([candidates[k] for k in prices], list(prices.values()))
     chosen = case.with_hanging(chosen)
+    chosen = case.without_still(chosen, photographs, seed)
     if not any(carrier_of(m, chosen) is not None for m in chosen):
         chosen = case.corrected(chosen, photographs)
         chosen = case.heard_again(chosen, candidates, photographs, seed)
@@ -388,6 +390,23 @@ class _Case:
                 return more
             more = more[:least] + more[least + 1 :]
         return chosen
+
+    def without_still(
+        self, chosen: list[Motion], photographs: Sequence[Sequence[Photograph]], seed: int
+    ) -> list[Motion]:
+        """The motions but for those of points whose texture has stayed where it is, rather than gone along."""
+        ways = [m.T for m in chosen]
+        texture = self._texture_under(ways, photographs, seed)
+        owned = self.problem.labels(ways)
+
+        def along(k: int | None, mine: Pair) -> int:
+            return int((likeness(texture(k, mine)) > GOES_ALONG).sum())
+
+        def still(k: int) -> bool:
+            mine = owned[0] == k + 1, owned[1] == k + 1
+            return (stayed := along(None, mine)) >= ENOUGH and stayed > along(k, mine)
+
+        return [motion for k, motion in enumerate(chosen) if not still(k)]
 
     def corrected(self, chosen: Sequence[Motion], photographs: Sequence[Sequence[Photograph]]) -> list[Motion]:
         """The motions, each corrected by the texture of what it owns in state 0, then of what it owns in state 1."""

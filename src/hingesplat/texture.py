@@ -272,6 +272,7 @@ def _outward(points: np.ndarray, normals: np.ndarray, photographs: Sequence[Phot
 
 
 __all__ = [
+    "ENOUGH",
     "GOES_ALONG",
     "LEAST",
     "TextureConfig",
