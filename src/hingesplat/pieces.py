@@ -219,7 +219,7 @@ def passed_on(owned: Labels, surfaces: tuple[Surface, Surface], extent: float) -
     """(parts,) share of each part's points that lie on one other part in state 0, and on another in state 1; the less.
 
     Nobody hands a part over. Of two doors that look alike inside, one open in each state, the inside of one is taken
-    for that of the other: 0.7 and more, where no part of 60 objects had more than 0.3.
+    for that of the other: 0.7 and more, where no right part of 60 objects had more than 0.41.
     """
     parts = max(int(o.max(initial=0)) for o in owned)
     share = np.zeros((2, parts, parts))
