@@ -30,7 +30,8 @@ from hingesplat.twin import Twin
 ARTEFACTS = (
     *("config.json", "stages.json", "log.txt", "depth_state*.safetensors", "fit_state*.safetensors", "segmentation.*"),
     *("alignment.safetensors", "canonical.safetensors", "articulation.safetensors", "gaussians*.safetensors"),
-    *("twin.json", "parts", "export", "curves.json", "views", "motion.gif", "summary.*", "metrics.json", "report.html", "*.tmp"),
+    *("twin.json", "parts", "export", "curves.json", "views", "motion.gif", "summary.*", "metrics.json", "report.html"),
+    "*.tmp",
 )
 """Everything that a run folder holds; ``overwrite`` deletes these and nothing else."""
 Inherited = Mapping[str, tuple[Sequence[str], str]]
