@@ -115,3 +115,11 @@ def test_a_patch_that_pulls_elsewhere_hardly_counts() -> None:
     np.testing.assert_allclose(robust, [0.3, -0.2], atol=0.05)
     assert np.trace(less) > np.trace(sure)
     assert np.linalg.norm(_agreed(-stiff @ [0.3, -0.2], stiff, off, 1e9 * np.eye(2))[0]) < 1e-3
+
+
+def test_a_patch_whose_curvature_rounds_below_zero_does_no_harm() -> None:
+    """A fridge's door ended in a square root of less than nothing."""
+    stiff = np.array([np.diag([1.0, 1.0])] * 4 + [np.diag([1.0, -1e-6])])
+    pull = np.array([[0.1, 0.1], [-0.1, 0.1], [0.1, -0.1], [-0.1, -0.1], [0.0, 1.0]])
+    step, covariance = _agreed(pull, stiff, np.zeros(2), np.eye(2))
+    assert np.isfinite(step).all() and (np.linalg.eigvalsh(covariance) > 0).all()

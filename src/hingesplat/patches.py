@@ -354,7 +354,8 @@ def _agreed(
         H, g = np.tensordot(weight, stiff, 1), weight @ pull
         step = -np.linalg.solve(H + precision, g + precision @ off)
         left = pull + stiff @ step
-        distance = np.einsum("nk,nkl,nl->n", left, inverse, left)
+        # Rounding leaves curvatures a little negative where a patch feels nothing.
+        distance = np.maximum(np.einsum("nk,nkl,nl->n", left, inverse, left), 0)
         weight = 1 / np.sqrt(1 + distance / (3 * np.median(distance) + 1e-12)) if len(pull) else weight
     H, g = np.tensordot(weight, stiff, 1), weight @ pull
     value, vector = np.linalg.eigh(H)
