@@ -72,7 +72,6 @@ def articulate(
     *,
     fitted: Sequence[Gaussians] = (),
     maps: Sequence[Sequence[DepthMap]] = (),
-    known: np.ndarray | None = None,
     seed: int = 0,
     device: torch.device | str = "cpu",
     report: Report = lambda **_: None,
@@ -87,7 +86,6 @@ def articulate(
         views: training photographs of every state.
         fitted: each state's own Gaussians; L_art, L_vector and displacements without parts need them.
         maps: the depth of every photograph where it is known.
-        known: (movers,) bool, which first motions are right as they are; none if it is left out.
         device: where to optimise; what comes out is on the CPU.
     """
     rng = np.random.default_rng(seed)
@@ -98,8 +96,6 @@ def articulate(
     centres = part_centres(canonical, parts)
     first = config.frame == "first"
     poses = PoseDelta(torch.from_numpy(T_state_0).to(canonical.means), centres, extent, first_is_frame=first)
-    if known is not None:
-        poses.free[:, 1:][:, torch.from_numpy(known).to(device)] = 0
     pose_adam = torch.optim.Adam(poses.parameters, lr=config.pose_rate)
     rate = config.rates.means * extent
     identity = identity_of(canonical, parts, fitted, config.identity, extent, rate, generator)

@@ -33,7 +33,7 @@ DEEP, TILTED = 1.2, 0.3
 NEAR = 0.015
 """Extents from the drawn surface within which a patch is on it."""
 COUNT_AS_ONE = 20.0
-"""Patches side by side err alike: so many count as one beside what is known without them."""
+"""Patches side by side err alike: so many count as one in standard deviations."""
 STEP = 1e-3
 """For derivatives of poses, radians and extents."""
 
@@ -365,5 +365,5 @@ def _agreed(
     left = weight[:, None] * (pull - stiff @ (best @ g))
     spread = np.trace(best @ (left.T @ left)) / max(rank, 1)
     inflation = max(1.0, spread * len(pull) / max(len(pull) - rank, 1))
-    told, pulled = H / (inflation * COUNT_AS_ONE), g / (inflation * COUNT_AS_ONE)
-    return -np.linalg.solve(told + precision, pulled + precision @ off), np.linalg.inv(told + precision)
+    step = -np.linalg.solve(H / inflation + precision, g / inflation + precision @ off)
+    return step, np.linalg.inv(H / (inflation * COUNT_AS_ONE) + precision)

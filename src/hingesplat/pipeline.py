@@ -421,13 +421,12 @@ def initial_transforms(T_1_0: np.ndarray, states: int) -> np.ndarray:
 
 def _articulate(run: Run) -> None:
     canonical = Gaussians.load(run / "canonical.safetensors")
-    start = load_file(run / "segmentation.safetensors")
     T_state_0 = load_file(run / "alignment.safetensors")["T_state_0"].numpy()
     moved = Articulation(canonical, T_state_0, torch.zeros(len(T_state_0), len(canonical), 3))
     if T_state_0.shape[1] > 1:
         moved = articulate(
             canonical, T_state_0, run.views, run.config.articulate,
-            fitted=[_fitted(run, t) for t in range(len(T_state_0))], maps=_depths(run), known=start["known"].numpy(),
+            fitted=[_fitted(run, t) for t in range(len(T_state_0))], maps=_depths(run),
             seed=run.config.seed, device=run.device, report=run.reporting("articulate"),
         )  # fmt: skip
     extra = {"T_state_0": torch.from_numpy(np.asarray(moved.T_state_0)), "state_sh": moved.state_sh}
