@@ -153,6 +153,20 @@ def scene(kind: Literal["revolute", "prismatic", "static"], size: int, spacing: 
     return Scene(whole, T, (first, second))
 
 
+def off_by(made: Scene, degrees: float, shift: float = 0.01) -> np.ndarray:
+    """The true motions, the slab's disturbed."""
+    T = made.T_state_0.copy()
+    T[1, 1] = prismatic([0, 1, 1], shift) @ revolute([1.0, 1.0, 0.5], PIVOT, np.radians(degrees)) @ T[1, 1]
+    return T
+
+
+def distance(T: np.ndarray, made: Scene) -> float:
+    """Mean distance of the moved slab's Gaussians from where they belong."""
+    points = made.gaussians.means[made.gaussians.part == 1].double().numpy()
+    off = T[1, 1] - made.T_state_0[1, 1]
+    return float(np.linalg.norm(points @ off[:3, :3].T + off[:3, 3], axis=1).mean())
+
+
 def angle_between(T: np.ndarray, T_true: np.ndarray) -> float:
     """Degrees from one motion (4, 4) to another."""
     R = T[:3, :3].T @ T_true[:3, :3]

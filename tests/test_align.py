@@ -8,18 +8,10 @@ import torch
 
 from hingesplat.align import AlignConfig, align, shown_movers
 from hingesplat.gaussians import Gaussians, concatenate
-from hingesplat.screw import prismatic, revolute
-from scenes import PIVOT, Scene, angle_between, one_thread, scene  # noqa: F401
+from scenes import Scene, angle_between, distance, off_by, one_thread, scene  # noqa: F401
 
 FRONT, BACK = -0.45, -0.39
 """Between these in y lie the edges of the slab alone."""
-
-
-def off_by(made: Scene, degrees: float, shift: float = 0.01) -> np.ndarray:
-    """The true motions, the slab's disturbed."""
-    T = made.T_state_0.copy()
-    T[1, 1] = prismatic([0, 1, 1], shift) @ revolute([1.0, 1.0, 0.5], PIVOT, np.radians(degrees)) @ T[1, 1]
-    return T
 
 
 def aligned(
@@ -29,13 +21,6 @@ def aligned(
     first, second = keep or (np.ones(len(made.gaussians), bool),) * 2
     pair, labels = (made.gaussians[first], made.at(1)[second]), made.gaussians.part.numpy()
     return align(pair, (labels[first], labels[second]), 1, T, made.views, config or AlignConfig())
-
-
-def distance(T: np.ndarray, made: Scene) -> float:
-    """Mean distance of the moved slab's Gaussians from where they belong."""
-    points = made.gaussians.means[made.gaussians.part == 1].double().numpy()
-    off = T[1, 1] - made.T_state_0[1, 1]
-    return float(np.linalg.norm(points @ off[:3, :3].T + off[:3, 3], axis=1).mean())
 
 
 @pytest.mark.parametrize("kind", ["revolute", "prismatic"])

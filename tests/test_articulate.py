@@ -9,25 +9,17 @@ import torch
 from hingesplat.articulate import ArticulateConfig, Articulation, articulate
 from hingesplat.identity import IdentityConfig
 from hingesplat.physics import PhysicsConfig, RepelConfig
-from hingesplat.screw import prismatic, revolute
 from scenes import (
-    PIVOT,
     Scene,
     angle_between,
+    distance,
+    off_by,
     one_thread,  # noqa: F401
     scene,
 )
 
 CONFIG = ArticulateConfig(steps=80, pose_rate=4e-3)
 FEW = replace(CONFIG, steps=16, densify_every=6)
-
-
-def off_by(made: Scene, degrees: float, shift: float = 0.01) -> np.ndarray:
-    """The true motion, disturbed."""
-    T = made.T_state_0.copy()
-    wrong = prismatic([0, 1, 1], shift) @ revolute([1.0, 1.0, 0.5], PIVOT, np.radians(degrees))
-    T[1, 1] = wrong @ T[1, 1]
-    return T
 
 
 def run(made: Scene, config: ArticulateConfig, degrees: float = 2.0, seed: int = 0) -> tuple[Articulation, list[float]]:
@@ -42,13 +34,6 @@ def run(made: Scene, config: ArticulateConfig, degrees: float = 2.0, seed: int =
         report=lambda **r: losses.append(r["loss"]),
     )
     return found, losses
-
-
-def distance(T: np.ndarray, made: Scene) -> float:
-    """Mean distance of the moved slab's Gaussians from where they belong."""
-    points = made.gaussians.means[made.gaussians.part == 1].double().numpy()
-    off = T[1, 1] - made.T_state_0[1, 1]
-    return float(np.linalg.norm(points @ off[:3, :3].T + off[:3, 3], axis=1).mean())
 
 
 @pytest.mark.parametrize("kind", ["revolute", "prismatic"])

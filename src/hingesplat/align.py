@@ -91,11 +91,8 @@ def align(
     back = [_inverse(torch.stack([R[other]] * 2), torch.stack([t[other]] * 2)) for R, t in trials]
     there, here = errors_by_part(in_others, trials, judges), errors_by_part(in_first, back, [(), judges[0]])
     was, now = _mean(np.concatenate([there, here], 1))
-    u, _, vt = np.linalg.svd(R.cpu().double().numpy())
-    aligned = np.tile(np.eye(4), (*T_state_0.shape[:2], 1, 1))
-    aligned[..., :3, :3], aligned[..., :3, 3] = u @ vt, t.cpu().double().numpy()
     better = np.concatenate([[False], free & (now < was)])
-    return np.where(better[:, None, None], aligned, T_state_0)
+    return np.where(better[:, None, None], poses.T_state_0(), T_state_0)
 
 
 def _inverse(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:

@@ -143,11 +143,7 @@ def _result(
     seed: int,
 ) -> Articulation:
     g = optimiser.gaussians.detached().to("cpu")
-    with torch.no_grad():
-        R, t = (x.cpu() for x in poses.Rt())
-    T = np.tile(np.eye(4), (*R.shape[:2], 1, 1))
-    u, _, vt = np.linalg.svd(R.double().numpy())
-    T[..., :3, :3], T[..., :3, 3] = u @ vt, t.double().numpy()
+    T = poses.T_state_0()
     if isinstance(identity, Free):
         part, T = parts_of_shifts(g.means, optimiser.values["shift"].detach().cpu(), T.shape[1], seed)
         g = g.with_part(part)

@@ -49,6 +49,15 @@ class PoseDelta:
         t = (R_delta @ arm[..., None])[..., 0] + self.pivots + self.shift * self.free * self.extent
         return R, t
 
+    @torch.no_grad()
+    def T_state_0(self) -> np.ndarray:
+        """(states, parts, 4, 4) float64, rigid to the last digit."""
+        R, t = (x.cpu().double().numpy() for x in self.Rt())
+        u, _, vt = np.linalg.svd(R)
+        T = np.tile(np.eye(4), (*R.shape[:2], 1, 1))
+        T[..., :3, :3], T[..., :3, 3] = u @ vt, t
+        return T
+
 
 def draw_state(
     g: Gaussians,
@@ -98,13 +107,12 @@ def move_parts_alone(
     rng: np.random.Generator,
     *,
     state_sh: Tensor | None = None,
-    end: float = 0.02,
 ) -> None:
     """Improve ``poses`` on the photographs of the moved states by Adam, nothing else changing.
 
     Args:
         training: photographs of every state; those of state 0 are not asked.
-        rate: Adam step; decays to ``end`` of itself.
+        rate: Adam step; decays to 2 %.
         state_sh: (states, n, 3) colour offsets.
     """
     adam = torch.optim.Adam(poses.parameters, lr=rate)
@@ -114,7 +122,7 @@ def move_parts_alone(
         state, (R, t) = before + 1, poses.Rt()
         offset = None if state_sh is None else state_sh[state]
         pose_loss(g, R[state], t[state], view, ssim_weight, offset).backward()
-        pose_step(adam, rate, step / steps, end)
+        pose_step(adam, rate, step / steps)
 
 
 @torch.no_grad()

@@ -69,7 +69,6 @@ DISCOUNT = 2.5
 10 % of those of handles that were alike."""
 MEETING = 0.5
 """Share of a part's points that must meet its points of the other state, in one of the states."""
-
 PASSED_ON = 0.6
 """Share of a part's points that lie on one part in state 0 and on another in state 1, from which it is none."""
 
