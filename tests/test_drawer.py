@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hingesplat.drawer import drawn_out, insides
+from hingesplat.drawer import behind_fronts, drawn_out, insides
 from hingesplat.screw import prismatic, revolute
 from hingesplat.surface import Surface
 from hingesplat.tsdf import DistanceGrid
@@ -47,6 +47,26 @@ def test_what_lies_in_a_drawer_is_the_drawers(monkeypatch: pytest.MonkeyPatch, h
     expected = owned[1].copy()
     expected[len(mine) : len(mine) + 81] = hides and T is OUT
     np.testing.assert_array_equal(found[1], expected)
+
+
+@pytest.mark.parametrize("slides", [True, False])
+def test_what_is_behind_a_drawers_front_is_that_drawers(slides: bool) -> None:
+    """Of two, one above the other, each motion hides the walls of the other, too."""
+    lower = tray(0.3)
+    upper_front = lower[:1600] + np.array([0, 0, 0.4])
+    walls = len(lower) - 1600
+    points = np.concatenate([lower, upper_front])
+    given = np.repeat(
+        [1, 2, 2], [1600, walls, 1600]
+    )  # Labels of the lower drawer's front and walls, and the upper front.
+    may = np.ones(len(points), bool)
+    firm_lower, firm_upper = np.arange(len(points)) < 1600, np.arange(len(points)) >= len(lower)
+    told = [np.stack([~firm_upper, ~may]), np.stack([~firm_lower, ~firm_upper])]
+    T = [OUT if slides else revolute([0, 0, 1], [0.3, 0, 0], 0.5), prismatic([0, -1, 0], 0.2)]
+    for found in behind_fronts(T, (given, given), (surface(points),) * 2, 1.0, (told, told)):
+        wanted = given.copy()
+        wanted[1600 : 1600 + walls] = 1 if slides else 2
+        np.testing.assert_array_equal(found, wanted)
 
 
 def grid(full: bool = False) -> DistanceGrid:

@@ -10,6 +10,7 @@ from hingesplat.screw import (
     prismatic,
     revolute,
     screw_to_matrix,
+    slide_of,
 )
 
 ANGLES = [1e-12, 1e-8, 1e-6, 1e-3, 0.1, 1.0, 2.5, np.pi - 1e-3, np.pi - 1e-8, np.pi]
@@ -84,3 +85,11 @@ def test_line_distance() -> None:
     assert line_distance((0, 0, 0), (1, 0, 0), (9, 3, 4), (-2, 0, 0)) == pytest.approx(5)
     assert line_distance((0, 0, 0), (1, 0, 0), (9, 3, 4), (-1, 1e-9, 0)) == pytest.approx(5)
     assert line_distance((0, 0, 0), (1, 1, 0), (2, 2, 0), (1, -1, 0)) == pytest.approx(0, abs=1e-12)
+
+
+def test_what_only_slides_has_a_direction() -> None:
+    way = np.array([0.6, 0, -0.8])
+    np.testing.assert_allclose(slide_of([np.eye(4), prismatic(way, 0.1), prismatic(way, 0.3)]), way, atol=1e-12)
+    np.testing.assert_allclose(slide_of([prismatic(way, -0.2)]), -way, atol=1e-12)
+    assert slide_of([np.eye(4)]) is None
+    assert slide_of([prismatic(way, 0.1), revolute(way, np.zeros(3), 0.01)]) is None

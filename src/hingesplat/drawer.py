@@ -6,13 +6,14 @@ end is the worse one: its walls go on up to a back just before that of the cabin
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations
 
 import numpy as np
 from scipy import ndimage
 from scipy.spatial import ConvexHull, Delaunay, KDTree
 
-from hingesplat.labelling import hidden
-from hingesplat.screw import axes_across
+from hingesplat.labelling import Whereabouts, hidden
+from hingesplat.screw import axes_across, slide_of
 from hingesplat.se3 import moved
 from hingesplat.surface import Labels, Surface, components
 from hingesplat.tsdf import DistanceGrid
@@ -35,6 +36,8 @@ MARGIN = 3
 """Empty cells around a cross-section."""
 NARROW = 0.08
 """Extents of the object that a drawer is wide and high at least, for its contents to be told from its walls."""
+WITHIN = 0.03
+"""Extents of the object between points of one piece, and that a front is wide and high at least."""
 FEWEST = 24
 """Points of a surface that make an outline, or a back."""
 
@@ -58,7 +61,7 @@ def insides(T_1_0: Sequence[np.ndarray], owned: Labels, surfaces: tuple[Surface,
         for inwards in (axis, -axis):
             across, depth = axes_across(inwards), mine @ inwards
             near, far = np.quantile(depth, [STRAY, 1 - STRAY]) if len(mine) else (0, 0)
-            box = _largest(mine[depth > (near + far) / 2], 0.03 * extent) @ across.T
+            box = _largest(mine[depth > (near + far) / 2], WITHIN * extent) @ across.T
             if len(box) < FEWEST or _narrowest(box) < NARROW * extent:
                 continue
             outline = _outline(box)
@@ -68,6 +71,38 @@ def insides(T_1_0: Sequence[np.ndarray], owned: Labels, surfaces: tuple[Surface,
                 inner = inner[outline.find_simplex(at_end[inner] @ across.T) >= 0]
                 some, other = surfaces[s].rows(inner), surfaces[1 - s].sight
                 labels[s][inner[hidden(some, other) & hidden(some, other, T_s)]] = k
+    return labels
+
+
+def behind_fronts(
+    T_1_0: Sequence[np.ndarray], owned: Labels, surfaces: tuple[Surface, Surface], extent: float, told: Whereabouts
+) -> Labels:
+    """Labels in which what two motions take out of sight, one of them a slide, goes with the front that it is behind.
+
+    Of two drawers one above the other, each motion hides the walls of the other, too. But a drawer's box is behind its
+    front, and where that is those points say that no other motion explains.
+
+    Args:
+        T_1_0: (4, 4) motion of each part from state 0 to state 1.
+        owned: label of each point, 0 for the base.
+    """
+    labels = (owned[0].copy(), owned[1].copy())
+    for j, k in permutations(range(len(T_1_0)), 2):
+        axis = slide_of([T_1_0[k]])
+        if axis is None:
+            continue
+        fronts = []
+        for own, other in ((k, j), (j, k)):
+            firm = [(owned[s] == own + 1) & told[s][own][0] & ~told[s][other][0] for s in (0, 1)]
+            points = np.concatenate([surfaces[s].points[firm[s]] for s in (0, 1)])
+            fronts.append(_largest(points, WITHIN * extent) @ axes_across(axis).T)
+        if any(len(front) < FEWEST or _narrowest(front) < WITHIN * extent for front in fronts):
+            continue
+        mine, others = map(_outline, fronts)
+        for s in (0, 1):
+            loose = np.flatnonzero((owned[s] == j + 1) & told[s][k][0] & told[s][j][1])
+            flat = surfaces[s].points[loose] @ axes_across(axis).T
+            labels[s][loose[(mine.find_simplex(flat) >= 0) & (others.find_simplex(flat) < 0)]] = k + 1
     return labels
 
 
@@ -117,15 +152,6 @@ def drawn_out(
         if end > start + 2 * own:
             part = _extruded(part, section, inwards, end, covered, own)
     return part
-
-
-def slide_of(T_base_part: Sequence[np.ndarray]) -> np.ndarray | None:
-    """(3,) the direction of a part that only slides, given places (4, 4) on its way."""
-    turns, ways = np.array([T[:3, :3] for T in T_base_part]), np.array([T[:3, 3] for T in T_base_part])
-    length = np.linalg.norm(ways, axis=-1)
-    if not length.any() or np.abs(turns - np.eye(3)).max() > 1e-6:
-        return None
-    return ways[length.argmax()] / length.max()
 
 
 def _largest(points: np.ndarray, radius: float) -> np.ndarray:

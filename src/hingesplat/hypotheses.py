@@ -1,29 +1,52 @@
-"""Motions that may be those of the parts: from every patch of seeds the likeliest, refined on all that agree."""
+"""Motions that may be those of the parts: from every patch of seeds the likeliest, improved on what they concern."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from itertools import chain
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
+from scipy.spatial import KDTree
 
 from hingesplat.chains import misfit
-from hingesplat.labelling import seed_costs
+from hingesplat.labelling import WORTH, seed_costs, seed_gains
 from hingesplat.register import register
 from hingesplat.screw import axes_across, matrix_to_screw
 from hingesplat.se3 import moved
 from hingesplat.search import BASE, Motion, ScoreVolume, inverted, scan
 from hingesplat.stereo import Cloud
 from hingesplat.surface import Surface, components
+from hingesplat.visibility import Sight
 
 FLAT = 0.2
 """Thickness of a plate, beside its sides."""
+LINK = 0.035
+"""Extents between neighbours of one piece of seeds."""
 PATCH = 60
 """Seeds of a large piece for each patch that may be a part of its own."""
+MOSTLY = 0.8
+"""Share of a piece's seeds from which a plate of it is as good as the piece."""
+TRIED_PLANES = 64
+"""Seeds whose tangent planes are tried for the next plate."""
+LEVEL, FACING = 0.01, np.cos(np.radians(25))
+"""Extents off a plane, and cosine between normals, of what lies in it."""
 HANGING = 0.02
 """Mean error of the best joint on the base, as a fraction of the extent, from which a part may hang on another."""
-WORTH = 0.6
-"""A hypothesis is worth as much as it explains its seeds better than this."""
+LEADING = 0.75
+"""Score from which the best hypothesis of a patch climbs in any case."""
+START_APART, APART = 0.03, 0.02
+"""Extents between where two hypotheses take seeds, in the mean, for both to climb, and for both to be candidates."""
+MET, SAME_COLOUR, PARALLEL = 0.025, 0.3, 0.8
+"""Extents, RGB difference and cosine between normals within which a seed has come to lie on a surface."""
+CLIMB = ((0.06, (0.03, 0.015)), (0.03, (0.015, 0.007)), (0.015, (0.007, 0.0035)))
+"""Extents within which seeds are heard beside those that meet, and steps, one round after the other."""
+SETTLED, CLEARLY = (0.015, 0.007), 0.01
+"""Steps of a motion that has been registered, and by how much each must better a point's cost in the mean."""
+STEPS, ANYWHERE = 6, 6
+"""Steps of one size at most, and trials in each that change all numbers at once."""
+WIDE = np.array([2.0, 2.0, 1.0, 1.0, 2.0])
+"""Steps of an axis across itself, of its place, and of the motion along it, beside each other."""
 
 
 @dataclass(frozen=True)
@@ -32,10 +55,16 @@ class HypothesesConfig:
 
     seeds_per_search: int = 128
     """Seeds moved in one search."""
-    consensus_cost: float = 0.45
+    agreeing_cost: float = 0.45
     """A seed agrees with a motion that costs it less than this."""
-    consensus_motions: int = 50
-    """Hypotheses that are refined on all seeds that agree with them."""
+    starts: int = 60
+    """Hypotheses that climb, beside the best of every group of seeds."""
+    leaders: int = 3
+    """Of every group of seeds, hypotheses that climb in any case."""
+    climbing_points: int = 100
+    """Of each state, by which a hypothesis climbs."""
+    min_concerned: int = 10
+    """Of each state; a hypothesis that concerns fewer seeds stays where it is."""
     candidates: int = 80
     """Hypotheses among which the parts' motions are chosen."""
     min_points: int = 25
@@ -56,17 +85,23 @@ class Evidence:
     rng: np.random.Generator
 
     @cached_property
+    def trees(self) -> tuple[KDTree, KDTree]:
+        """Of the fresh points."""
+        return KDTree(self.fresh[0].points), KDTree(self.fresh[1].points)
+
+    @cached_property
     def blurred(self) -> tuple[np.ndarray, np.ndarray]:
         """Colours (n, 3) of the surfaces as coarse as the volumes."""
         return self.surfaces[0].blurred(), self.surfaces[1].blurred()
 
 
-def groups_to_try(points: np.ndarray, extent: float, seed: int) -> list[tuple[np.ndarray, bool]]:
-    """Connected pieces of the seeds, and patches of the pieces that are large enough to be several parts at once.
+def groups_to_try(points: np.ndarray, normals: np.ndarray, extent: float, seed: int) -> list[tuple[np.ndarray, bool]]:
+    """Connected pieces of the seeds, and patches and plates of the pieces that are large enough to be several parts.
 
-    Each with whether it is a whole piece.
+    Each with whether it may be a whole part: a piece or a plate. Two doors side by side are one piece.
     """
-    label = components(points, 0.035 * extent)
+    rng = np.random.default_rng(seed)
+    label = components(points, LINK * extent)
     groups = []
     for piece in range(label.max(initial=-1) + 1):
         index = np.flatnonzero(label == piece)
@@ -77,7 +112,30 @@ def groups_to_try(points: np.ndarray, extent: float, seed: int) -> list[tuple[np
         if patches >= 2:
             which = kmeans2(points[index], patches, rng=np.random.default_rng(seed), minit="++")[1]
             groups += [(index[which == p], False) for p in range(patches) if (which == p).sum() >= 12]
+            flat = [index[rows] for rows in plates(points[index], normals[index], extent, rng)]
+            groups += [(rows, True) for rows in flat if len(rows) < MOSTLY * len(index)]
     return groups
+
+
+def plates(points: np.ndarray, normals: np.ndarray, extent: float, rng: np.random.Generator) -> list[np.ndarray]:
+    """Rows of points (n, 3) that lie connected in a plane, the planes that hold most of them first (RANSAC).
+
+    Args:
+        normals: (n, 3) unit, either side.
+    """
+    left, found = np.arange(len(points)), []
+    while len(left) >= PATCH:
+        p, n = points[left], normals[left]
+        tried = rng.choice(len(left), min(TRIED_PLANES, len(left)), replace=False)
+        level = np.abs((p @ n[tried].T) - (p[tried] * n[tried]).sum(1)) < LEVEL * extent
+        within = level & (np.abs(n @ n[tried].T) > FACING)
+        plane = within[:, within.sum(0).argmax()]
+        if plane.sum() < PATCH:
+            break
+        piece = components(p[plane], LINK * extent)
+        found += [left[plane][piece == k] for k in np.flatnonzero(np.bincount(piece) >= PATCH)]
+        left = left[~plane]
+    return found
 
 
 def axis_directions(groups: Sequence[np.ndarray]) -> np.ndarray:
@@ -118,44 +176,69 @@ def edges(points: np.ndarray) -> list[Motion]:
     return found
 
 
-def propose(evidence: Evidence, seeds: Sequence[np.ndarray], after: np.ndarray = BASE) -> list[Motion]:
-    """Hypotheses, as motions from state 0 to 1, from every group of seeds (rows of both states' surfaces).
+def propose(evidence: Evidence, seeds: Sequence[np.ndarray], after: np.ndarray = BASE) -> list[list[Motion]]:
+    """Hypotheses, as motions from state 0 to 1, for every group of seeds (rows of both states' surfaces), best first.
 
     ``after`` (4, 4) is the motion of another part, on which these seeds hang.
     """
     e, surfaces = evidence, evidence.surfaces
     groups = []
     for s in (0, 1):
-        p = surfaces[s].points[seeds[s]]
-        tried = groups_to_try(p, e.extent, seed=int(e.rng.integers(2**31)))
+        there = surfaces[s].rows(seeds[s])
+        tried = groups_to_try(there.points, there.normals, e.extent, seed=int(e.rng.integers(2**31)))
         groups += [(s, seeds[s][index], whole) for index, whole in tried]
     if not groups:
         return []
     directions = axis_directions([surfaces[s].points[g] for s, g, _ in groups])
-    pool = []
+    pools = []
     for s, group, whole in groups:
         chosen = e.rng.choice(group, min(e.config.seeds_per_search, len(group)), replace=False)
-        p, c = surfaces[s].points[chosen], surfaces[s].colours[chosen]
-        blurred, then = e.blurred[s][chosen], after if s == 0 else np.linalg.inv(after)
-
-        def add(motion: Motion, s: int = s, chosen: np.ndarray = chosen) -> None:
-            motion = polished([motion], surfaces[s].rows(chosen), e.fresh[1 - s], e.extent)
-            pool.append(motion if s == 0 else inverted(motion))
-
+        mine, blurred = surfaces[s].rows(chosen), e.blurred[s][chosen]
+        then = after if s == 0 else np.linalg.inv(after)
+        search = partial(scan, seeds=mine.points, colours=blurred, volume=e.coarse[1 - s], after=then)
+        found: list[Motion] = []
         # Of a door that shows its inside in one state and its outside in the other little meets: an edge is its hinge.
         for edge in edges(surfaces[s].points[group]) if whole and len(group) >= PATCH else []:
-            for motion in scan("revolute", p, blurred, edge.axis[None], e.coarse[1 - s], near=edge, after=then, keep=1):
-                add(motion)
+            found += search("revolute", directions=edge.axis[None], near=edge, keep=2)
         # Slides get a hearing of their own: with three numbers fewer they are seldom the luckiest fit.
         for kind in ("revolute", "prismatic"):
-            found = scan(kind, p, blurred, directions, e.coarse[1 - s], after=then, keep=4)
-            for motion in found:
-                if motion.score > max(0.1, 0.7 * found[0].score):
-                    # Compare hypotheses at their best: on the grid a true one may be 3° off and lose to a lucky one.
-                    for spread in (4.0, 1.5):
-                        motion = refine_motion(motion, p, c, e.fine[1 - s], spread)
-                    add(motion)
-    return pool
+            best = search(kind, directions=directions, keep=4)
+            found += [motion for motion in best if motion.score > max(0.1, 0.7 * best[0].score)]
+        judged = [liked(values_around(motion, e.extent), mine, surfaces[1 - s].sight, e.extent) for motion in found]
+        pool = [motion if s == 0 else inverted(motion) for motion in judged]
+        pools.append(sorted(pool, key=lambda m: -m.score))
+    return pools
+
+
+def candidates(evidence: Evidence, seeds: Sequence[np.ndarray], judges: tuple[np.ndarray, np.ndarray]) -> list[Motion]:
+    """Motions that may be those of the parts, no two of them alike; none where nothing moved.
+
+    ``seeds`` and ``judges``, some of them, are rows of each state's points. A hypothesis comes from one patch, and is
+    off by several per cent of the extent: the most promising of all, and the best of every patch, climb.
+    """
+    e, surfaces = evidence, evidence.surfaces
+    pools = propose(e, seeds)
+    pool = list(chain(*pools))
+    if not pool:
+        return []
+    sample = np.concatenate([surfaces[s].points[judges[s][:100]] for s in (0, 1)])
+
+    def promising(motions: Sequence[Motion], apart: float, limit: int) -> list[Motion]:
+        ways = [m.T for m in motions], [inverted(m).T for m in motions]
+        gain = [seed_gains(surfaces[s].rows(judges[s]), surfaces[1 - s].sight, ways[s], e.extent) for s in (0, 1)]
+        return [motions[k] for k in distinct(motions, np.concatenate(gain), sample, apart * e.extent, limit)]
+
+    best = [m for motions in pools for m in motions[: e.config.leaders] if m.score > LEADING]
+    starts = promising(pool, START_APART, e.config.starts)
+    for motion in best:
+        if not any(_apart(motion, other, sample) < START_APART * e.extent for other in starts):
+            starts.append(motion)
+    return promising([*(climbed(e, m, judges) for m in starts), *pool], APART, e.config.candidates)
+
+
+def _apart(first: Motion, second: Motion, points: np.ndarray) -> float:
+    """Mean distance of the places to which two motions take points (n, 3)."""
+    return float(np.linalg.norm(moved(points, first.T) - moved(points, second.T), axis=1).mean())
 
 
 def propose_hanging(
@@ -171,11 +254,12 @@ def propose_hanging(
     config, least = evidence.config, HANGING * evidence.extent
     if sum(map(len, seeds)) < config.min_points:
         return []
-    pool = [motion for carrier in carriers for motion in propose(evidence, seeds, carrier.T)]
+    pools = [motions[: config.leaders] for carrier in carriers for motions in propose(evidence, seeds, carrier.T)]
+    pool = [climbed(evidence, motion, seeds) for motion in chain(*pools)]
     if not pool:
         return []
     points = np.concatenate([evidence.surfaces[s].points[seeds[s]] for s in (0, 1)])
-    agreeing = [points[agree] for agree in (costs_of(pool) < config.consensus_cost).T]
+    agreeing = [points[agree] for agree in (costs_of(pool) < config.agreeing_cost).T]
     return [
         motion
         for motion, own in zip(pool, agreeing, strict=True)
@@ -183,33 +267,86 @@ def propose_hanging(
     ]
 
 
-def consensus(
-    evidence: Evidence, seeds: Sequence[np.ndarray], pool: Sequence[Motion], costs: np.ndarray
-) -> list[Motion]:
-    """The most promising hypotheses, each refined on all seeds that agree with it wherever they are.
+def climbed(evidence: Evidence, motion: Motion, seeds: Sequence[np.ndarray]) -> Motion:
+    """The motion, changed little by little until it explains best those seeds that it seems to concern.
 
-    A hypothesis comes from one patch; the right one fits the whole part, and grows better with it.
+    These are seeds, rows of each state's points, that come to lie on what is new in the other state, and those near
+    them: what is off at the edge of a part has to be heard, or nothing would hold a plate in its own plane. A right
+    motion that is 8 % of the extent off comes near, as fewer are left out and steps get smaller; a wrong one gets no
+    better.
     """
-    config = evidence.config
-    sample = np.concatenate([evidence.surfaces[s].points[seeds[s][:100]] for s in (0, 1)])
-    refined = []
-    for k in distinct(pool, costs, sample, 0.02 * evidence.extent, config.consensus_motions):
-        agree = costs[:, k] < config.consensus_cost
-        own = (seeds[0][agree[: len(seeds[0])]], seeds[1][agree[len(seeds[0]) :]])
-        refined.append(refit(evidence, pool[k], own))
-    return refined
+    for near, steps in CLIMB:
+        own = [_concerned(evidence, s, motion if s == 0 else inverted(motion), seeds[s], near) for s in (0, 1)]
+        if min(map(len, own)) < evidence.config.min_concerned:
+            return motion
+        motion = _climb(evidence, motion, (own[0], own[1]), steps, 1e-4)
+    return motion
 
 
-def distinct(motions: Sequence[Motion], costs: np.ndarray, points: np.ndarray, apart: float, limit: int) -> list[int]:
+def _climb(
+    evidence: Evidence, motion: Motion, own: tuple[np.ndarray, np.ndarray], steps: Sequence[float], least: float
+) -> Motion:
+    """The motion, changed by ``steps`` as long as it costs some of the points it owns (rows) less, by ``least``."""
+    e = evidence
+    most = e.config.climbing_points
+    first, second = (e.surfaces[s].rows(e.rng.permutation(own[s])[:most]) for s in (0, 1))
+
+    def cost(motions: Sequence[Motion]) -> np.ndarray:
+        there = seed_costs(first, e.surfaces[1].sight, [m.T for m in motions], e.extent, 0.0)
+        back = seed_costs(second, e.surfaces[0].sight, [inverted(m).T for m in motions], e.extent, 0.0)
+        return np.concatenate([there, back]).mean(0)
+
+    best = float(cost([motion])[0])
+    for step in steps:
+        for _ in range(STEPS):
+            trials = around(motion, step, e.extent, e.rng)
+            costs = cost(trials)
+            if costs.min() > best - least:
+                break
+            motion, best = trials[int(costs.argmin())], float(costs.min())
+    return replace(motion, score=1 - best)
+
+
+def _concerned(evidence: Evidence, state: int, motion: Motion, seeds: np.ndarray, near: float) -> np.ndarray:
+    """Those of the seeds (rows) of a state that a motion from there lays on what is new, and those near them."""
+    mine, (fresh, tree) = evidence.surfaces[state].rows(seeds), (evidence.fresh[1 - state], evidence.trees[1 - state])
+    gap, index = map(np.asarray, tree.query(moved(mine.points, motion.T), distance_upper_bound=MET * evidence.extent))
+    met = np.flatnonzero(np.isfinite(gap))
+    there = index[met]
+    alike = np.linalg.norm(fresh.colours[there] - mine.colours[met], axis=1) < SAME_COLOUR
+    parallel = np.abs((fresh.normals[there] * (mine.normals[met] @ motion.T[:3, :3].T)).sum(1)) > PARALLEL
+    met = met[alike & parallel]
+    if len(met) == 0:
+        return seeds[:0]
+    return seeds[KDTree(mine.points[met]).query(mine.points)[0] <= near * evidence.extent]
+
+
+def around(motion: Motion, step: float, extent: float, rng: np.random.Generator) -> list[Motion]:
+    """Motions a step, radians or extents, away from one: along each of its numbers, and some along all."""
+    turns = motion.kind == "revolute"
+    ways = np.concatenate([np.diag(WIDE), -np.diag(WIDE), rng.normal(size=(ANYWHERE, len(WIDE)))])
+    if not turns:  # A slide is nowhere.
+        ways = ways[ways[:, [0, 1, 4]].any(1)]
+    across = axes_across(motion.axis)
+    axes = motion.axis + step * ways[:, :2] @ across
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    pivots = motion.pivot + step * extent * turns * ways[:, 2:4] @ across
+    values = motion.value + step * ways[:, 4] * (1 if turns else extent)
+    return [
+        replace(motion, axis=axis, pivot=pivot, value=float(value))
+        for axis, pivot, value in zip(axes, pivots, values, strict=True)
+    ]
+
+
+def distinct(motions: Sequence[Motion], gain: np.ndarray, points: np.ndarray, apart: float, limit: int) -> list[int]:
     """The most promising hypotheses for all of the seeds, small parts' too, no two of them the same.
 
-    ``costs`` (seeds, motions). A seed counts less with every hypothesis that explains it. Two hypotheses are one if
-    they take ``points`` (n, 3) to places that lie within ``apart`` on average.
+    ``gain`` (seeds, motions), at most ``WORTH``. A seed counts less with every hypothesis that explains it. Two
+    hypotheses are one if they take ``points`` (n, 3) to places that lie within ``apart`` on average.
     """
-    gain = np.maximum(WORTH - costs, 0)
     ends = np.stack([moved(points, m.T) for m in motions])
     left = np.ones(len(motions), bool)
-    weight = np.ones(len(costs))
+    weight = np.ones(len(gain))
     kept: list[int] = []
     while left.any() and len(kept) < limit:
         best = int(np.where(left, weight @ gain, -1).argmax())
@@ -263,7 +400,7 @@ def refit(evidence: Evidence, motion: Motion, own: tuple[np.ndarray, np.ndarray]
         return motions[int((there + back).argmin())]
 
     fit = best(values_around(best(trials), extent))
-    return fit if s == 0 else inverted(fit)
+    return _climb(evidence, fit if s == 0 else inverted(fit), own, SETTLED, CLEARLY)
 
 
 def values_around(motion: Motion, extent: float) -> list[Motion]:
@@ -274,13 +411,15 @@ def values_around(motion: Motion, extent: float) -> list[Motion]:
 
 def polished(trials: Sequence[Motion], mine: Surface, other: Surface, extent: float) -> Motion:
     """The best of some motions, their registrations and a little more or less of these, as the cameras judge them."""
+    fits = [registered(m, mine.cloud, other.cloud, extent) for m in trials]
+    motion = liked([*trials, *fits], mine, other.sight, extent)
+    return liked(values_around(motion, extent), mine, other.sight, extent)
 
-    def best(motions: Sequence[Motion]) -> Motion:
-        costs = seed_costs(mine, other.sight, [m.T for m in motions], extent, 0.0)
-        return motions[int(costs.mean(0).argmin())]
 
-    motion = best([*trials, *(registered(m, mine.cloud, other.cloud, extent) for m in trials)])
-    return best(values_around(motion, extent))
+def liked(motions: Sequence[Motion], mine: Surface, other: Sight, extent: float) -> Motion:
+    """The best of some motions of a surface, as the other state's cameras judge them; its score says how good."""
+    costs = seed_costs(mine, other, [m.T for m in motions], extent, 0.0).mean(0)
+    return replace(motions[int(costs.argmin())], score=1 - float(costs.min()))
 
 
 def registered(motion: Motion, source: Cloud, target: Cloud, extent: float) -> Motion:

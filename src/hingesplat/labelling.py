@@ -4,11 +4,13 @@ A point's cost under a motion is what the other state's photographs say of the p
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 import torch
+from numba import njit
 from scipy.sparse import csr_matrix
 from scipy.spatial import KDTree
 
@@ -22,6 +24,8 @@ HIDDEN_COST = 0.25
 """Cost of a point that a motion takes out of everybody's sight."""
 HIDDEN_SEED_COST = 0.4
 """Cost of a seed that a motion takes out of everybody's sight."""
+WORTH = 0.6
+"""A motion is worth as much as it explains its seeds better than this."""
 SLACK, CLEAR = 0.02, 0.2
 """Share of the views that may see a point in free space for nothing, and by how much more it is a contradiction."""
 SAME, OTHER = 0.05, 0.5
@@ -29,10 +33,14 @@ SAME, OTHER = 0.05, 0.5
 NOBODY = 0.3
 """What a point without a partner in the other state hears from it, between a partner that disagrees (0) and one that
 agrees (1)."""
+UNMET = 0.5
+"""What a point counts that a promising motion takes where the other state shows none."""
 NEARLY = 0.3
 """Cost of a point by which one explanation is no more than a little worse than another."""
-ADDED, EXCHANGED, PAIRED = 10, 6, 4
-"""Motions that each round of a choice tries to add, to exchange for one that is there, and to combine in exchange."""
+AT_ONCE = 400_000
+"""Places that photographs are asked about in one go."""
+ADDED, EXCHANGED, PAIRED, SECOND = 10, 6, 8, 2
+"""Motions that each round of a choice tries to add, to exchange for one that is there, and first and second of two."""
 
 
 def label_costs(
@@ -50,15 +58,29 @@ def label_costs(
     Label 0 is to stay; label k + 1 is to move by ``transforms[k]``, 4×4 from the surface's state to the other. Who
     moves out of everybody's sight costs ``hidden_cost``; who stays and is covered by something that moves, less.
     """
-    columns = []
-    for T in [None, *transforms]:
-        contradiction, arrived, colour = _told(surface, other, T)
-        # To move is a claim: it costs a little, and to be recognised far away costs more.
-        way = 0 if T is None else np.linalg.norm(moved(surface.points, T) - surface.points, axis=1) / extent
-        claim = 0.0 if T is None else 0.05 + far_cost * way * arrived
-        unseen = covered_cost if T is None else hidden_cost
-        columns.append(contradiction + arrived * 0.5 * colour + (1 - arrived) * unseen + claim)
-    return np.stack(columns, 1)
+    priced = _priced(surface, other, [None, *transforms], extent, hidden_cost, covered_cost, far_cost)
+    return np.stack([cost for cost, _ in priced], 1)
+
+
+def _priced(
+    surface: Surface,
+    other: Sight,
+    labels: Sequence[np.ndarray | None],
+    extent: float,
+    hidden_cost: float,
+    covered_cost: float,
+    far_cost: float,
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """For each label, (4, 4) or None to stay, every point's cost (n,), and how surely it is seen to arrive, 0 … 1."""
+    at_once = max(AT_ONCE // max(len(surface.points), 1), 1)
+    for start in range(0, len(labels), at_once):
+        some = labels[start : start + at_once]
+        for T, contradiction, arrived, colour in zip(some, *_told(surface, other, some), strict=True):
+            # To move is a claim: it costs a little, and to be recognised far away costs more.
+            way = 0 if T is None else np.linalg.norm(moved(surface.points, T) - surface.points, axis=1) / extent
+            claim = 0.0 if T is None else 0.05 + far_cost * way * arrived
+            unseen = covered_cost if T is None else hidden_cost
+            yield contradiction + arrived * 0.5 * colour + (1 - arrived) * unseen + claim, arrived
 
 
 def whereabouts(surface: Surface, other: Sight, T: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -67,9 +89,22 @@ def whereabouts(surface: Surface, other: Sight, T: np.ndarray | None = None) -> 
     Returns:
         (n,) bool each. Who is lost may be there, but nobody sees it.
     """
-    contradiction, arrived, _ = _told(surface, other, T)
+    ((contradiction,), (arrived,), _) = _told(surface, other, [T])
     may = contradiction < 0.1
     return may, may & (arrived < 0.3)
+
+
+Whereabouts = tuple[list[np.ndarray], list[np.ndarray]]
+"""For each state, of every motion: ``whereabouts`` of all its points, (2, n) bool."""
+
+
+def whereabouts_under(T_1_0: Sequence[np.ndarray], surfaces: tuple[Surface, Surface]) -> Whereabouts:
+    """Which points may follow each motion, and which of them are lost on the way."""
+    first, second = surfaces
+    return (
+        [np.stack(whereabouts(first, second.sight, T)) for T in T_1_0],
+        [np.stack(whereabouts(second, first.sight, np.linalg.inv(T))) for T in T_1_0],
+    )
 
 
 def hidden(surface: Surface, other: Sight, T: np.ndarray | None = None) -> np.ndarray:
@@ -79,18 +114,26 @@ def hidden(surface: Surface, other: Sight, T: np.ndarray | None = None) -> np.nd
 
 def gone(surface: Surface, other: Sight) -> np.ndarray:
     """(n,) bool: points in whose place the other state's photographs show nothing, or another colour."""
-    contradiction, arrived, colour = _told(surface, other, None)
+    ((contradiction,), (arrived,), (colour,)) = _told(surface, other, [None])
     return ((contradiction >= 0.5) & (arrived < 0.3)) | (arrived * colour > 0.3)
 
 
-def _told(surface: Surface, other: Sight, T: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What photographs say of points moved by T, (n,) in 0 … 1 each: seen through, seen, and of another colour."""
-    answer = ask(surface.points if T is None else moved(surface.points, T), surface.colours, other)
+def _told(
+    surface: Surface, other: Sight, transforms: Sequence[np.ndarray | None]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What photographs say of points moved by each of the transforms (None: not at all).
+
+    Returns:
+        (transforms, n) in 0 … 1 each: seen through, seen, and of another colour.
+    """
+    points = np.stack([surface.points if T is None else moved(surface.points, T) for T in transforms])
+    answer = ask(points.reshape(-1, 3), np.tile(surface.colours, (len(transforms), 1)), other)
+    answer = answer.reshape(*points.shape[:2], 4)
     # A point a little in front of its surface floats in some photographs of its own state, too.
     contradiction = np.clip((free_share(answer) - surface.free_at_home - SLACK) / CLEAR, 0, 1)
     # Every surface is hidden from most sides: a few views that see it there are enough.
-    arrived = np.clip(answer[:, SURFACE] / ARRIVED, 0, 1)
-    return contradiction, arrived, np.clip((answer[:, COLOUR] - SAME) / OTHER, 0, 1)
+    arrived = np.clip(answer[..., SURFACE] / ARRIVED, 0, 1)
+    return contradiction, arrived, np.clip((answer[..., COLOUR] - SAME) / OTHER, 0, 1)
 
 
 def seed_costs(
@@ -98,6 +141,15 @@ def seed_costs(
 ) -> np.ndarray:
     """(n, transforms) cost of each motion for each seed. Here hidden is worse than seen: a seed must go somewhere."""
     return label_costs(seeds, other, transforms, extent=extent, hidden_cost=HIDDEN_SEED_COST, far_cost=far_cost)[:, 1:]
+
+
+def seed_gains(seeds: Surface, other: Sight, transforms: Sequence[np.ndarray], extent: float) -> np.ndarray:
+    """(n, transforms) by how much each motion explains each seed better than ``WORTH``, as far as it is seen there.
+
+    What hides can be had from many motions: it says nothing of which is right.
+    """
+    priced = _priced(seeds, other, transforms, extent, HIDDEN_SEED_COST, HIDDEN_SEED_COST, 0.3)
+    return np.stack([np.maximum(WORTH - cost, 0) * arrived for cost, arrived in priced], 1)
 
 
 def neighbour_weights(points: np.ndarray, colours: np.ndarray, radius: float, k: int = 12) -> csr_matrix:
@@ -150,29 +202,19 @@ class Labelling:
         return result
 
     def mean_field(
-        self, costs: list[np.ndarray], partners: list[np.ndarray], iterations: int = 20
+        self, costs: Sequence[np.ndarray], partners: Sequence[np.ndarray], iterations: int = 20
     ) -> tuple[Labels, float]:
         """Labels of both states and the energy they cost.
 
         A point hears its own costs, its neighbours, and the point of the other state it would coincide with under
         each label: if k carries me there, the one who lives there should be k, too.
         """
-        q = [softmax(-c / 0.1) for c in costs]
-        label = np.arange(costs[0].shape[1])
-        energy = 0.0
-        for iteration in range(iterations):
-            temperature = 0.15 - 0.1 * iteration / iterations
-            updated, energy = [], 0.0
-            for s in (0, 1):
-                support = self.smoothness * (self.weights[s] @ q[s])
-                partner = q[1 - s][np.maximum(partners[s], 0), label]
-                meeting = self.consistency * np.where(partners[s] >= 0, partner, NOBODY)
-                total = costs[s] - support - meeting
-                updated.append(softmax(-total / temperature))
-                # Each edge is heard from both its ends, so pairs count half.
-                energy += float((updated[s] * (costs[s] - 0.5 * support - 0.5 * meeting)).sum())
-            q = updated
-        return (q[0].argmax(1), q[1].argmax(1)), energy
+        problems = []
+        for c, p, w in zip(costs, partners, self.weights, strict=True):
+            graph = w.indptr.astype(np.int32), w.indices.astype(np.int32), w.data.astype(np.float32)
+            problems.append((c.astype(np.float32), p.astype(np.int32), *graph))
+        first, second, energy = _mean_field(problems[0], problems[1], self.smoothness, self.consistency, iterations)
+        return (first, second), float(energy)
 
     def labels(self, T_1_0: Sequence[np.ndarray]) -> Labels:
         """Labels of both states' points under these motions, all of which stay."""
@@ -188,6 +230,61 @@ class Labelling:
             worse = np.delete(own, k + 1, 1).min(1) - own[:, k + 1]
             result[k] = (worse > NEARLY).mean() if len(own) else 0
         return result
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _update(
+    q, other, costs, partners, start, end, weight, smoothness, consistency, temperature, updated
+):  # pragma: no cover - compiled
+    """``updated`` (n, labels) from both states' present ``q`` and ``other``; the energy of this state."""
+    labels = costs.shape[1]
+    total, half = np.empty(labels, np.float32), np.empty(labels, np.float32)
+    energy = 0.0
+    for i in range(len(costs)):
+        total[:] = 0
+        for e in range(start[i], start[i + 1]):
+            for k in range(labels):
+                total[k] += weight[e] * q[end[e], k]
+        least = np.float32(np.inf)
+        for k in range(labels):
+            partner = partners[i, k]
+            heard = smoothness * total[k] + consistency * (other[partner, k] if partner >= 0 else np.float32(NOBODY))
+            # Each edge is heard from both its ends, so pairs count half.
+            half[k], total[k] = costs[i, k] - np.float32(0.5) * heard, costs[i, k] - heard
+            least = min(least, total[k])
+        share = np.float32(0)
+        for k in range(labels):
+            updated[i, k] = np.exp((least - total[k]) / temperature)
+            share += updated[i, k]
+        for k in range(labels):
+            updated[i, k] /= share
+            energy += updated[i, k] * half[k]
+    return energy
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _mean_field(problem0, problem1, smoothness, consistency, iterations):  # pragma: no cover - compiled
+    """Labels of each state's points and the energy; a problem: costs, partners, and the graph of neighbours (CSR)."""
+    costs0, partners0, start0, end0, weight0 = problem0
+    costs1, partners1, start1, end1, weight1 = problem1
+    smooth, consistent = np.float32(smoothness), np.float32(consistency)
+    q0, q1 = np.empty_like(costs0), np.empty_like(costs1)
+    for costs, q in ((costs0, q0), (costs1, q1)):
+        for i in range(len(costs)):
+            q[i] = np.exp((costs[i].min() - costs[i]) / np.float32(0.1))
+            q[i] /= q[i].sum()
+    u0, u1 = np.empty_like(q0), np.empty_like(q1)
+    energy = 0.0
+    for iteration in range(iterations):
+        temperature = np.float32(0.15 - 0.1 * iteration / iterations)
+        energy = _update(q0, q1, costs0, partners0, start0, end0, weight0, smooth, consistent, temperature, u0)
+        energy += _update(q1, q0, costs1, partners1, start1, end1, weight1, smooth, consistent, temperature, u1)
+        q0, u0, q1, u1 = u0, q0, u1, q1
+    first, second = np.empty(len(q0), np.int64), np.empty(len(q1), np.int64)
+    for q, label in ((q0, first), (q1, second)):
+        for i in range(len(q)):
+            label[i] = q[i].argmax()
+    return first, second, energy
 
 
 def meeting(partners: Sequence[np.ndarray], owned: Labels) -> np.ndarray:
@@ -219,6 +316,7 @@ class Choices:
         self.problem, self.number = problem, len(T_1_0)
         self._costs, self._partners = problem.costs(T_1_0), problem.partners(T_1_0)
         self._solutions: dict[frozenset[int], tuple[Labels, float]] = {}
+        self._promises: dict[frozenset[int], np.ndarray] = {}
 
     def _solved(self, kept: frozenset[int]) -> tuple[Labels, float]:
         """Labels that are columns of the costs, and their energy."""
@@ -244,7 +342,11 @@ class Choices:
             too_many = 0 if parts is None else max(len(kept) - parts, 0)
             return self._solved(kept)[1] + float(prices[sorted(kept)].sum()) + points * too_many
 
-        return shortest(length, lambda kept: self._promising(kept, prices))
+        def lengths(sets: Sequence[frozenset[int]]) -> list[float]:
+            with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+                return list(pool.map(length, sets))
+
+        return shortest(lengths, lambda kept: self._promising(kept, prices))
 
     def gains(self, kept: frozenset[int]) -> dict[int, float]:
         """What each of the most promising others would explain besides these, in points; the best first."""
@@ -261,55 +363,62 @@ class Choices:
 
     def _promising(self, kept: frozenset[int], prices: np.ndarray) -> list[int]:
         """All motions, those first that the points would gain most by if their partners agreed, less their prices."""
-        labels, consistency = self._solved(kept)[0], self.problem.consistency
-        gain = np.zeros(self.number)
-        for s, weights in enumerate(self.problem.weights):
-            costs, partners = self._costs[s], self._partners[s]
-            row, label = np.arange(len(labels[s])), labels[s]
-            met = partners >= 0
-            agree = np.where(met[row, label], labels[1 - s][partners[row, label]] == label, NOBODY)
-            now = costs[row, label] - 0.5 * consistency * agree
-            then = costs - 0.5 * consistency * np.where(met, 1.0, NOBODY)
-            better = (now[:, None] - then)[:, 1:]
-            average = (weights @ better + better) / (1 + weights.sum(1))
-            gain += np.maximum(np.asarray(average), 0).sum(0)
-        return [int(k) for k in np.argsort(prices - gain)]
+        if kept not in self._promises:
+            labels, consistency = self._solved(kept)[0], self.problem.consistency
+            gain = np.zeros(self.number)
+            for s, weights in enumerate(self.problem.weights):
+                costs, partners = self._costs[s], self._partners[s]
+                row, label = np.arange(len(labels[s])), labels[s]
+                met = partners >= 0
+                agree = np.where(met[row, label], labels[1 - s][partners[row, label]] == label, NOBODY)
+                now = costs[row, label] - 0.5 * consistency * agree
+                then = costs - 0.5 * consistency * np.where(met, 1.0, NOBODY)
+                better = (now[:, None] - then)[:, 1:]
+                average = (weights @ better + better) / (1 + weights.sum(1))
+                # Who hides may be anywhere.
+                gain += (np.maximum(np.asarray(average), 0) * np.where(met[:, 1:], 1, UNMET)).sum(0)
+            self._promises[kept] = gain
+        return [int(k) for k in np.argsort(prices - self._promises[kept])]
 
 
 def shortest(
-    length: Callable[[frozenset[int]], float], promising: Callable[[frozenset[int]], Sequence[int]]
+    lengths: Callable[[Sequence[frozenset[int]]], Sequence[float]],
+    promising: Callable[[frozenset[int]], Sequence[int]],
 ) -> frozenset[int]:
     """The set of the least length that adding, dropping and exchanging lead to, from the empty set.
 
-    ``promising`` names what may be added to a set, the best first. Two motions that are right together replace one
-    that is nearly right for both, which comes first; and two replace two where look-alikes are taken for each other, so
-    that either exchange alone is worse.
+    Two motions that are right together replace one that is nearly right for both, which comes first; and two replace
+    two where look-alikes are taken for each other, so that either exchange alone is worse.
+
+    Args:
+        lengths: of sets, measured together.
+        promising: names what may be added to a set, the best first.
     """
+
+    def two_more(less: frozenset[int], kept: frozenset[int]) -> Iterator[frozenset[int]]:
+        """The set with two more that were not in another, the second chosen once the first is there."""
+        for first in [k for k in promising(less) if k not in kept][:PAIRED]:
+            once = less | {first}
+            yield from (once | {k} for k in [k for k in promising(once) if k not in kept | once][:SECOND])
 
     def trials(kept: frozenset[int]) -> Iterator[list[frozenset[int]]]:
         """Sets beside ``kept``, the few first: what is many has its turn when nothing else helps."""
         others = [k for k in promising(kept) if k not in kept]
         smaller = [kept - {k} for k in sorted(kept)]
         yield smaller + [kept | {k} for k in others[:ADDED]]
-        exchanged = [less | {k} for less in smaller for k in others[:EXCHANGED]]
-        yield exchanged
-        instead = [[k for k in promising(less) if k not in kept][:PAIRED] for less in smaller]
-        yield [less | set(pair) for less, ks in zip(smaller, instead, strict=True) for pair in combinations(ks, 2)]
-        near = sorted(exchanged, key=length)[:PAIRED]
-        second = [[k for k in promising(once) if k not in kept | once][:PAIRED] for once in near]
-        yield [once - {j} | {k} for once, ks in zip(near, second, strict=True) for j in once & kept for k in ks]
+        yield [less | {k} for less in smaller for k in others[:EXCHANGED]]
+        yield [more for less in smaller for more in two_more(less, kept)]
+        yield [more for pair in combinations(sorted(kept), 2) for more in two_more(kept - set(pair), kept)]
 
     kept: frozenset[int] = frozenset()
+    (least,) = lengths([kept])
     while True:
         for beside in trials(kept):
-            best = min(beside, key=length, default=kept)
-            if length(best) < length(kept) - 1:
-                kept = best
+            length, best = min(
+                zip(lengths(beside), beside, strict=True), key=lambda pair: pair[0], default=(least, kept)
+            )
+            if length < least - 1:
+                kept, least = best, length
                 break
         else:
             return kept
-
-
-def softmax(x: np.ndarray) -> np.ndarray:
-    e = np.exp(x - x.max(1, keepdims=True))
-    return e / e.sum(1, keepdims=True)

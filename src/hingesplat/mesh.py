@@ -20,9 +20,10 @@ from skimage.measure import marching_cubes
 from trimesh.visual import ColorVisuals
 
 from hingesplat.camera import Camera
-from hingesplat.drawer import drawn_out, slide_of
+from hingesplat.drawer import drawn_out
 from hingesplat.gaussians import SH_C0, Gaussians, posed
 from hingesplat.render import rasterize
+from hingesplat.screw import slide_of
 from hingesplat.se3 import wxyz_to_matrix
 from hingesplat.stereo import DepthMap, contradicted, cubes
 from hingesplat.tsdf import DepthView, DistanceGrid, distance_to, fuse_depth, tangent_planes

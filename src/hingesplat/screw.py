@@ -4,6 +4,7 @@ Right-handed about the axis, radians, scene units; numpy float64. Chasles' theor
 screw, up to the sign of its axis.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -106,6 +107,15 @@ def axes_across(axis: np.ndarray) -> Float[np.ndarray, "2 3"]:
     u = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     u /= np.linalg.norm(u)
     return np.stack([u, np.cross(axis, u)])
+
+
+def slide_of(T_base_part: Sequence[np.ndarray]) -> np.ndarray | None:
+    """(3,) the direction of a part that only slides, given places (4, 4) on its way."""
+    turns, ways = np.array([T[:3, :3] for T in T_base_part]), np.array([T[:3, 3] for T in T_base_part])
+    length = np.linalg.norm(ways, axis=-1)
+    if not length.any() or np.abs(turns - np.eye(3)).max() > 1e-6:
+        return None
+    return ways[length.argmax()] / length.max()
 
 
 def _unit(axis: ArrayLike) -> np.ndarray:

@@ -14,28 +14,28 @@ from itertools import combinations
 import numpy as np
 from scipy.spatial import KDTree
 
+from hingesplat.borders import bordered
 from hingesplat.capture import View
-from hingesplat.drawer import insides
+from hingesplat.drawer import behind_fronts, insides
 from hingesplat.gaussians import Gaussians
 from hingesplat.hypotheses import (
     Evidence,
     HypothesesConfig,
-    consensus,
-    distinct,
-    propose,
+    candidates,
     propose_hanging,
     refit,
 )
-from hingesplat.labelling import Choices, Labelling, meeting, seed_costs
+from hingesplat.labelling import Choices, Labelling, meeting, seed_costs, whereabouts_under
 from hingesplat.patches import Photograph
 from hingesplat.pieces import (
     follow_fronts,
     give_way,
+    lying_on,
     passed_on,
     reattach_fragments,
+    riding,
     seen_to_move,
     split_pieces,
-    whereabouts_under,
 )
 from hingesplat.se3 import moved
 from hingesplat.search import BASE, Motion, ScoreVolume, carrier_of, inverted, novelty, score_volume
@@ -69,8 +69,9 @@ DISCOUNT = 2.5
 10 % of those of handles that were alike."""
 MEETING = 0.5
 """Share of a part's points that must meet its points of the other state, in one of the states."""
-PASSED_ON = 0.6
-"""Share of a part's points that lie on one part in state 0 and on another in state 1, from which it is none."""
+PASSED_ON, RIDING = 0.5, 0.6
+"""Share of a part's points that lie on one part in state 0 and on another in state 1, or on the same in both, from
+which it is none."""
 
 
 @dataclass(frozen=True)
@@ -203,20 +204,20 @@ def segment(
     evidence, seeds = gather(surfaces, low, high, config, np.random.default_rng(seed))
     judges = (seeds[0][: config.max_seeds], seeds[1][: config.max_seeds])
     n_seeds = sum(map(len, seeds))
-    candidates = _candidates(evidence, seeds, judges)
-    if not candidates:
+    found = candidates(evidence, seeds, judges)
+    if not found:
         empty = (np.zeros(len(gaussians[0]), int), np.zeros(len(gaussians[1]), int))
         return Segmentation(empty, (), 0.0, n_seeds)
 
     case = _Case.of(evidence, judges, config, parts)
     photographs = [photographs_of(g, v, config.texture) for g, v in zip(gaussians, views, strict=True)]
-    prices = case.told_by_texture([m.T for m in candidates], photographs, seed)
-    chosen = case.settled([candidates[k] for k in prices], list(prices.values()))
+    prices = case.told_by_texture(found, photographs, seed)
+    chosen = case.settled([found[k] for k in prices], list(prices.values()))
     chosen = case.with_hanging(chosen)
     chosen = case.without_still(chosen, photographs, seed)
     if not any(carrier_of(m, chosen) is not None for m in chosen):
         chosen = case.corrected(chosen, photographs)
-        chosen = case.heard_again(chosen, candidates, photographs, seed)
+        chosen = case.heard_again(chosen, found, photographs, seed)
     chosen, owned = _labelled(chosen, surfaces, evidence.extent, config, parts)
     costs = _seed_costs(evidence, judges, chosen) if chosen else np.ones((1, 1))
     unexplained = float((costs.min(1) >= config.explained_cost).mean())
@@ -232,23 +233,6 @@ def _seed_costs(evidence: Evidence, seeds: Pair, motions: Sequence[Motion]) -> n
         for s in (0, 1)
     )
     return np.concatenate([first, second])
-
-
-def _candidates(evidence: Evidence, seeds: Sequence[np.ndarray], judges: Pair) -> list[Motion]:
-    """Motions that may be those of the parts, no two of them alike; none where nothing moved.
-
-    ``seeds`` and ``judges``, some of them, are rows of each state's points.
-    """
-    pool = propose(evidence, seeds)
-    if not pool:
-        return []
-    costs = _seed_costs(evidence, judges, pool)
-    refined = consensus(evidence, judges, pool, costs)
-    costs = np.concatenate([costs, _seed_costs(evidence, judges, refined)], 1)
-    pool += refined
-    sample = np.concatenate([evidence.surfaces[s].points[judges[s][:100]] for s in (0, 1)])
-    apart, limit = 0.012 * evidence.extent, evidence.config.candidates
-    return [pool[k] for k in distinct(pool, costs, sample, apart, limit)]
 
 
 @dataclass(frozen=True)
@@ -274,11 +258,17 @@ class _Case:
         return _Case(evidence, seeds, (rows[0], rows[1]), problem, config, parts)
 
     def told_by_texture(
-        self, ways: Sequence[np.ndarray], photographs: Sequence[Sequence[Photograph]], seed: int
+        self, motions: Sequence[Motion], photographs: Sequence[Sequence[Photograph]], seed: int
     ) -> dict[int, float]:
-        """Which of the motions (4, 4) there are, and their prices: look-alikes told apart, and what is nearly alike."""
+        """Which of the motions there are, and their prices: look-alikes told apart, and what is nearly alike."""
         surfaces, extent, price = self.problem.surfaces, self.evidence.extent, self.config.part_cost
+        ways = [m.T for m in motions]
         texture = self._texture_under(ways, photographs, seed)
+
+        def verdict(k: int, mine: Pair) -> float:
+            """Of the motion that fits these points: one 2 % off would not go along with its own texture."""
+            fit = refit(self.evidence, motions[k], (self.rows[0][mine[0]], self.rows[1][mine[1]]))
+            return against(compared(surfaces, photographs, fit.T, mine, extent, self.config.texture, seed))
 
         def nearly_alike(k: int, _: float, others: Collection[int], mine: Pair) -> bool:
             """Two drawers pulled out by nearly the same are one to points and colours, or nearly so."""
@@ -286,7 +276,7 @@ class _Case:
             return any(alike(points, ways[j], ways[k], extent) for j in others)
 
         choices = Choices(self.problem, ways)
-        told = told_apart(choices, lambda *asked: against(texture(*asked)), price, self.parts)
+        told = told_apart(choices, verdict, price, self.parts)
         return vouched_for(
             choices, told, nearly_alike, lambda *asked: likeness(texture(*asked)), LEAST * price, self.parts
         )
@@ -433,7 +423,10 @@ def _labelled(
         transforms = [m.T for m in motions]
         partners = problem.partners(transforms)
         owned = problem.mean_field(problem.costs(transforms), partners)[0]
-        doubt = np.maximum(MEETING - meeting(partners, owned), passed_on(owned, surfaces, extent) - PASSED_ON)
+        share = lying_on(owned, surfaces, extent)
+        own_joint = np.array([not m.by_texture and carrier_of(m, motions) is None for m in motions], float)
+        doubts = MEETING - meeting(partners, owned), passed_on(share) - PASSED_ON, own_joint * riding(share) - RIDING
+        doubt = np.max(doubts, axis=0)
         if doubt.max(initial=0) <= 0:
             break
         worst = int(doubt.argmax())
@@ -443,11 +436,12 @@ def _labelled(
         motions, owned = pieces
     transforms = [m.T for m in motions]
     owned = reattach_fragments(transforms, owned, surfaces, extent)
-    if len(motions) > 1:
-        told = whereabouts_under(transforms, surfaces)
-        owned = give_way(transforms, owned, surfaces, extent, told)
-        owned = follow_fronts(owned, surfaces, extent, told)
+    told = whereabouts_under(transforms, surfaces)
+    owned = give_way(transforms, owned, surfaces, extent, told)
+    owned = follow_fronts(owned, surfaces, extent, told)
+    owned = behind_fronts(transforms, owned, surfaces, extent, told)
     owned = insides(transforms, owned, surfaces, extent)
+    owned = bordered(transforms, owned, problem, told)
     return seen_to_move(motions, owned, surfaces, config.min_part_seeds)
 
 

@@ -53,8 +53,8 @@ class Surface:
 
 
 def free_share(answer: np.ndarray) -> np.ndarray:
-    """(n,) share of the views that see each point in free space, from what ``ask`` answers."""
-    return answer[:, FREE] / np.maximum(answer[:, : HIDDEN + 1].sum(1), 1)
+    """(…,) share of the views that see each point in free space, from what ``ask`` answers, (…, 4)."""
+    return answer[..., FREE] / np.maximum(answer[..., : HIDDEN + 1].sum(-1), 1)
 
 
 def bounds(surfaces: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
