@@ -29,7 +29,7 @@ def labelled(
 ) -> Labels:
     moved_cost = np.where(THIRDS == 0, 1.0, 0.0)
     costs = np.stack([np.where(THIRDS == 2, 1.0, 0.0), moved_cost], 1)
-    monkeypatch.setattr("hingesplat.borders.label_costs", lambda *_, **__: costs)
+    monkeypatch.setattr("hingesplat.labelling.label_costs", lambda *_, **__: costs)
     told = [np.stack([np.ones(90, bool), np.zeros(90, bool) if lost is None else lost])]
     return bordered([T], (OWNED, OWNED), Labelling.of((surface, surface), 1.0), (told, told))
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.sparse import block_array, coo_matrix, csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
-from hingesplat.labelling import Labelling, Whereabouts, label_costs
+from hingesplat.labelling import Labelling, Whereabouts
 from hingesplat.screw import slide_of
 from hingesplat.surface import Labels
 
@@ -32,18 +32,14 @@ def bordered(T_1_0: Sequence[np.ndarray], owned: Labels, problem: Labelling, tol
         told: ``whereabouts_under`` these motions: what nobody would see arrive is not asked about.
     """
     links, owner = _links(problem), np.concatenate(owned)
-    ways, surfaces = [list(T_1_0), [np.linalg.inv(T) for T in T_1_0]], problem.surfaces
-    costs = np.concatenate(
-        [label_costs(surfaces[s], surfaces[1 - s].sight, ways[s], extent=problem.extent, far_cost=0.0) for s in (0, 1)]
-    )
+    costs = np.concatenate(problem.costs(T_1_0, far_cost=0.0))
     labels = owner.copy()
     for k, T in enumerate(T_1_0, 1):
         lost = np.concatenate([told[s][k - 1][1] for s in (0, 1)])
         worse = costs[:, k] - costs[:, 0]
         kind = "revolute" if slide_of([T]) is None else "prismatic"
-        if (
-            kind == "revolute"
-        ):  # Of a bar that slides along itself few points, its ends, know; of a hub none, but noise.
+        # Of a bar that slides along itself few points, its ends, know; of a hub none, but noise.
+        if kind == "revolute":
             worse = (links @ worse + worse) / (np.asarray(links.sum(1)).ravel() + 1)
         stays = (owner == 0) & (worse >= STAYS[kind])
         loose = np.flatnonzero((owner == 0) & ~lost & ~stays)

@@ -180,13 +180,13 @@ class Labelling:
         w0, w1 = (neighbour_weights(s.points, s.colours, 0.025 * extent) for s in surfaces)
         return Labelling(surfaces, (w0, w1), (KDTree(surfaces[0].points), KDTree(surfaces[1].points)), extent)
 
-    def costs(self, T_1_0: Sequence[np.ndarray]) -> list[np.ndarray]:
+    def costs(self, T_1_0: Sequence[np.ndarray], far_cost: float = 0.3) -> list[np.ndarray]:
         """``label_costs`` of both states' points."""
         a, b = self.surfaces
         inverse = [np.linalg.inv(T) for T in T_1_0]
         return [
-            label_costs(a, b.sight, T_1_0, extent=self.extent),
-            label_costs(b, a.sight, inverse, extent=self.extent),
+            label_costs(a, b.sight, T_1_0, extent=self.extent, far_cost=far_cost),
+            label_costs(b, a.sight, inverse, extent=self.extent, far_cost=far_cost),
         ]
 
     def partners(self, T_1_0: Sequence[np.ndarray]) -> list[np.ndarray]:
