@@ -45,7 +45,7 @@ from hingesplat.pieces import (
 from hingesplat.render import render
 from hingesplat.screw import prismatic, revolute
 from hingesplat.se3 import moved
-from hingesplat.search import Motion, inverted
+from hingesplat.search import Motion, inverted, there_and_back
 from hingesplat.segment import (
     SegmentConfig,
     _Case,
@@ -56,6 +56,7 @@ from hingesplat.segment import (
     spread_labels,
     survey,
 )
+from hingesplat.simd import LANES
 from hingesplat.states import segment_states, track
 from hingesplat.stereo import Cloud, DepthMap, StereoConfig, depth_map, stereo
 from hingesplat.surface import Labels, Surface, bounds, components, surface_of, thin
@@ -229,6 +230,14 @@ def test_a_seed_that_hides_says_nothing_of_a_motion() -> None:
     assert (gain[:, 1] == 0).all() and (cost[:, 1] < WORTH).all()
 
 
+def test_many_ways_there_and_back_are_those_of_each_motion() -> None:
+    hanging = replace(SHIFT, after=TURN.T)
+    there, back = there_and_back([TURN, SHIFT, hanging])
+    for k, motion in enumerate((TURN, SHIFT, hanging)):
+        np.testing.assert_allclose(there[k], motion.T, atol=1e-12)
+        np.testing.assert_allclose(back[k], inverted(motion).T, atol=1e-12)
+
+
 def test_inverted_undoes() -> None:
     for motion in (TURN, PULL):
         np.testing.assert_allclose(inverted(motion).T @ motion.T, np.eye(4), atol=1e-12)
@@ -369,12 +378,13 @@ def test_two_look_alikes_taken_for_each_other_are_exchanged_together() -> None:
 # Labels.
 
 
-def test_labels_settle_as_mean_field_says(rng: np.random.Generator) -> None:
-    """Compiled, they are those of the definition, energy and all."""
+@pytest.mark.parametrize("number", [4, LANES + 3])
+def test_labels_settle_as_mean_field_says(number: int, rng: np.random.Generator) -> None:
+    """Compiled, they are those of the definition, energy and all; more of them than a vector holds, too."""
     surfaces = plain(rng.uniform(0, 0.1, (60, 3))), plain(rng.uniform(0, 0.1, (50, 3)))
     problem = Labelling.of(surfaces, 1.0)
-    costs = [rng.uniform(0, 1, (n, 4)) for n in (60, 50)]
-    partners = [rng.integers(-1, other, (n, 4)) for n, other in ((60, 50), (50, 60))]
+    costs = [rng.uniform(0, 1, (n, number)) for n in (60, 50)]
+    partners = [rng.integers(-1, other, (n, number), np.int32) for n, other in ((60, 50), (50, 60))]
 
     def softmax(x: np.ndarray) -> np.ndarray:
         e = np.exp(x - x.max(1, keepdims=True))
@@ -384,7 +394,7 @@ def test_labels_settle_as_mean_field_says(rng: np.random.Generator) -> None:
     for iteration in range(20):
         updated, energy = [], 0.0
         for s in (0, 1):
-            partner = np.where(partners[s] >= 0, q[1 - s][np.maximum(partners[s], 0), np.arange(4)], 0.3)
+            partner = np.where(partners[s] >= 0, q[1 - s][np.maximum(partners[s], 0), np.arange(number)], 0.3)
             heard = problem.smoothness * (problem.weights[s] @ q[s]) + problem.consistency * partner
             updated.append(softmax(-(costs[s] - heard) / (0.15 - 0.1 * iteration / 20)))
             energy += float((updated[s] * (costs[s] - 0.5 * heard)).sum())
@@ -545,6 +555,14 @@ def test_no_price_is_paid_for_a_motion_that_only_hides(turned: Turned) -> None:
     into_the_box = prismatic(FORWARD, -0.5 * extent)
     choices = Choices(Labelling.of(surfaces, extent), [into_the_box, TURN.T])
     assert choices.best(np.full(2, float(PRICE)), None) == {1}
+
+
+def test_what_others_explain_nearly_as_well_is_not_explained_at_first_hand(turned: Turned) -> None:
+    """Of two motions that are the same neither sees what the other does not; one alone explains more than its price."""
+    _, surfaces, extent = turned
+    choices = Choices(Labelling.of(surfaces, extent), [TURN.T, TURN.T])
+    assert choices.firsthand(frozenset({0}))[0] > 2 * PRICE
+    assert max(choices.firsthand(frozenset({0, 1})).values()) < 0.1 * PRICE
 
 
 def test_texture_is_asked_about_what_is_chosen_and_may_have_it_replaced(turned: Turned) -> None:

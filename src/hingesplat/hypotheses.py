@@ -13,8 +13,8 @@ from hingesplat.chains import misfit
 from hingesplat.labelling import WORTH, seed_costs, seed_gains
 from hingesplat.register import register
 from hingesplat.screw import axes_across, matrix_to_screw
-from hingesplat.se3 import moved
-from hingesplat.search import BASE, Motion, ScoreVolume, inverted, scan
+from hingesplat.se3 import apart, moved
+from hingesplat.search import BASE, Motion, ScoreVolume, inverted, scan, there_and_back
 from hingesplat.stereo import Cloud
 from hingesplat.surface import Surface, components
 from hingesplat.visibility import Sight
@@ -43,6 +43,8 @@ CLIMB = ((0.06, (0.03, 0.015)), (0.03, (0.015, 0.007)), (0.015, (0.007, 0.0035))
 """Extents within which seeds are heard beside those that meet, and steps, one round after the other."""
 SETTLED, CLEARLY = (0.015, 0.007), 0.01
 """Steps of a motion that has been registered, and by how much each must better a point's cost in the mean."""
+GO_ON = 0.5
+"""Share of those that climb, the most promising, that go on after each round."""
 STEPS, ANYWHERE = 6, 6
 """Steps of one size at most, and trials in each that change all numbers at once."""
 WIDE = np.array([2.0, 2.0, 1.0, 1.0, 2.0])
@@ -78,11 +80,14 @@ class Evidence:
     surfaces: tuple[Surface, Surface]
     fresh: tuple[Surface, Surface]
     """The points of each state that the other does not show in the same place: there something may have come to lie."""
-    coarse: tuple[ScoreVolume, ScoreVolume]
-    fine: tuple[ScoreVolume, ScoreVolume]
+    volumes: tuple[ScoreVolume, ScoreVolume]
     extent: float
     config: HypothesesConfig
     rng: np.random.Generator
+
+    def seen(self, seeds: Sequence[np.ndarray]) -> tuple[Surface, Surface]:
+        """Of each state, the points in these rows."""
+        return self.surfaces[0].rows(seeds[0]), self.surfaces[1].rows(seeds[1])
 
     @cached_property
     def trees(self) -> tuple[KDTree, KDTree]:
@@ -195,7 +200,7 @@ def propose(evidence: Evidence, seeds: Sequence[np.ndarray], after: np.ndarray =
         chosen = e.rng.choice(group, min(e.config.seeds_per_search, len(group)), replace=False)
         mine, blurred = surfaces[s].rows(chosen), e.blurred[s][chosen]
         then = after if s == 0 else np.linalg.inv(after)
-        search = partial(scan, seeds=mine.points, colours=blurred, volume=e.coarse[1 - s], after=then)
+        search = partial(scan, seeds=mine.points, colours=blurred, volume=e.volumes[1 - s], after=then)
         found: list[Motion] = []
         # Of a door that shows its inside in one state and its outside in the other little meets: an edge is its hinge.
         for edge in edges(surfaces[s].points[group]) if whole and len(group) >= PATCH else []:
@@ -223,33 +228,41 @@ def candidates(evidence: Evidence, seeds: Sequence[np.ndarray], judges: tuple[np
         return []
     sample = np.concatenate([surfaces[s].points[judges[s][:100]] for s in (0, 1)])
 
-    def promising(motions: Sequence[Motion], apart: float, limit: int) -> list[Motion]:
-        ways = [m.T for m in motions], [inverted(m).T for m in motions]
-        gain = [seed_gains(surfaces[s].rows(judges[s]), surfaces[1 - s].sight, ways[s], e.extent) for s in (0, 1)]
-        return [motions[k] for k in distinct(motions, np.concatenate(gain), sample, apart * e.extent, limit)]
+    def promising(motions: Sequence[Motion], least: float, limit: int) -> list[Motion]:
+        gain = both_ways(seed_gains, e.seen(judges), motions, e.extent)
+        return [motions[k] for k in distinct(motions, gain, sample, least * e.extent, limit)]
 
     best = [m for motions in pools for m in motions[: e.config.leaders] if m.score > LEADING]
-    starts = promising(pool, START_APART, e.config.starts)
+    climbing = promising(pool, START_APART, e.config.starts)
     for motion in best:
-        if not any(_apart(motion, other, sample) < START_APART * e.extent for other in starts):
-            starts.append(motion)
-    return promising([*(climbed(e, m, judges) for m in starts), *pool], APART, e.config.candidates)
+        if all(apart(sample, motion.T, other.T) >= START_APART * e.extent for other in climbing):
+            climbing.append(motion)
+    for near, steps in CLIMB:
+        climbing = [_climbed(e, motion, judges, near, steps) for motion in climbing]
+        climbing = promising(climbing, APART, round(GO_ON * len(climbing)))
+    return promising([*climbing, *pool], APART, e.config.candidates)
 
 
-def _apart(first: Motion, second: Motion, points: np.ndarray) -> float:
-    """Mean distance of the places to which two motions take points (n, 3)."""
-    return float(np.linalg.norm(moved(points, first.T) - moved(points, second.T), axis=1).mean())
+def both_ways(
+    asked: Callable[[Surface, Sight, Sequence[np.ndarray], float], np.ndarray],
+    some: tuple[Surface, Surface],
+    motions: Sequence[Motion],
+    extent: float,
+) -> np.ndarray:
+    """(points, motions) what each state's photographs say of the other state's points, ``asked`` of both in turn."""
+    there, back = map(list, there_and_back(motions))
+    first, second = some
+    return np.concatenate([asked(first, second.sight, there, extent), asked(second, first.sight, back, extent)])
 
 
-def propose_hanging(
-    evidence: Evidence,
-    seeds: Sequence[np.ndarray],
-    carriers: Sequence[Motion],
-    costs_of: Callable[[Sequence[Motion]], np.ndarray],
-) -> list[Motion]:
+_costs_anywhere = partial(seed_costs, far_cost=0.0)
+"""How far a motion takes a seed says nothing of which of its neighbours is right."""
+
+
+def propose_hanging(evidence: Evidence, seeds: Sequence[np.ndarray], carriers: Sequence[Motion]) -> list[Motion]:
     """Hypotheses for seeds that no joint on the base explains: joints on the parts that the carriers move.
 
-    Only motions that no joint on the base comes near; ``costs_of`` gives the (seeds, motions) costs of these seeds.
+    Only motions that no joint on the base comes near.
     """
     config, least = evidence.config, HANGING * evidence.extent
     if sum(map(len, seeds)) < config.min_points:
@@ -259,7 +272,8 @@ def propose_hanging(
     if not pool:
         return []
     points = np.concatenate([evidence.surfaces[s].points[seeds[s]] for s in (0, 1)])
-    agreeing = [points[agree] for agree in (costs_of(pool) < config.agreeing_cost).T]
+    costs = both_ways(seed_costs, evidence.seen(seeds), pool, evidence.extent)
+    agreeing = [points[agree] for agree in (costs < config.agreeing_cost).T]
     return [
         motion
         for motion, own in zip(pool, agreeing, strict=True)
@@ -276,11 +290,18 @@ def climbed(evidence: Evidence, motion: Motion, seeds: Sequence[np.ndarray]) -> 
     better.
     """
     for near, steps in CLIMB:
-        own = [_concerned(evidence, s, motion if s == 0 else inverted(motion), seeds[s], near) for s in (0, 1)]
-        if min(map(len, own)) < evidence.config.min_concerned:
-            return motion
-        motion = _climb(evidence, motion, (own[0], own[1]), steps, 1e-4)
+        motion = _climbed(evidence, motion, seeds, near, steps)
     return motion
+
+
+def _climbed(
+    evidence: Evidence, motion: Motion, seeds: Sequence[np.ndarray], near: float, steps: Sequence[float]
+) -> Motion:
+    """After one round."""
+    own = [_concerned(evidence, s, motion if s == 0 else inverted(motion), seeds[s], near) for s in (0, 1)]
+    if min(map(len, own)) < evidence.config.min_concerned:
+        return motion
+    return _climb(evidence, motion, (own[0], own[1]), steps, 1e-4)
 
 
 def _climb(
@@ -289,12 +310,10 @@ def _climb(
     """The motion, changed by ``steps`` as long as it costs some of the points it owns (rows) less, by ``least``."""
     e = evidence
     most = e.config.climbing_points
-    first, second = (e.surfaces[s].rows(e.rng.permutation(own[s])[:most]) for s in (0, 1))
+    some = e.seen((e.rng.permutation(own[0])[:most], e.rng.permutation(own[1])[:most]))
 
     def cost(motions: Sequence[Motion]) -> np.ndarray:
-        there = seed_costs(first, e.surfaces[1].sight, [m.T for m in motions], e.extent, 0.0)
-        back = seed_costs(second, e.surfaces[0].sight, [inverted(m).T for m in motions], e.extent, 0.0)
-        return np.concatenate([there, back]).mean(0)
+        return both_ways(_costs_anywhere, some, motions, e.extent).mean(0)
 
     best = float(cost([motion])[0])
     for step in steps:
@@ -344,7 +363,7 @@ def distinct(motions: Sequence[Motion], gain: np.ndarray, points: np.ndarray, ap
     ``gain`` (seeds, motions), at most ``WORTH``. A seed counts less with every hypothesis that explains it. Two
     hypotheses are one if they take ``points`` (n, 3) to places that lie within ``apart`` on average.
     """
-    ends = np.stack([moved(points, m.T) for m in motions])
+    ends = moved(points, there_and_back(motions)[0])
     left = np.ones(len(motions), bool)
     weight = np.ones(len(gain))
     kept: list[int] = []
@@ -356,25 +375,6 @@ def distinct(motions: Sequence[Motion], gain: np.ndarray, points: np.ndarray, ap
     return kept
 
 
-def refine_motion(
-    motion: Motion, points: np.ndarray, colours: np.ndarray, volume: ScoreVolume, spread_deg: float
-) -> Motion:
-    """A finer search around one hypothesis: its axis tilted by up to ``spread_deg``, angles and slides to match."""
-    tilt = np.tan(np.radians(spread_deg))
-    u, w = axes_across(motion.axis)
-    tilted = np.array([motion.axis + tilt * (a * u + b * w) for a in (-1, 0, 1) for b in (-1, 0, 1) if a or b])
-    tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
-    values = motion.value + np.linspace(-1, 1, 9) * (
-        np.radians(spread_deg) if motion.kind == "revolute" else 2 * volume.voxel
-    )
-    straight, best = (
-        scan(motion.kind, points, colours, axes, volume, values=values, near=motion, after=motion.after, keep=1)[0]
-        for axes in (motion.axis[None], tilted)
-    )
-    # The volume is coarse: an axis is tilted only for a clear gain, and the photographs settle the rest later.
-    return best if best.score > straight.score + 0.02 else straight
-
-
 def refit(evidence: Evidence, motion: Motion, own: tuple[np.ndarray, np.ndarray]) -> Motion:
     """Refine on the points that the motion owns (rows), from the state that has more of them to those of the other."""
     surfaces, extent, config, rng = evidence.surfaces, evidence.extent, evidence.config, evidence.rng
@@ -384,22 +384,18 @@ def refit(evidence: Evidence, motion: Motion, own: tuple[np.ndarray, np.ndarray]
     limit = 4 * config.seeds_per_search
     mine, theirs = (surfaces[t].rows(rng.choice(own[t], min(limit, len(own[t])), replace=False)) for t in (s, 1 - s))
     start = motion if s == 0 else inverted(motion)
-    if len(theirs.points) < config.min_points:
-        few = mine.rows(np.arange(min(2 * config.seeds_per_search, len(mine.points))))
-        near = refine_motion(start, few.points, few.colours, evidence.fine[1 - s], 3.0)
-        fit = polished([start, near], mine, evidence.fresh[1 - s], extent)
-        return fit if s == 0 else inverted(fit)
-    # Against the whole of the other state a drawer would cling to the frame that it slides along.
-    target = surfaces[1 - s].rows(own[1 - s]).cloud
-    once = registered(start, mine.cloud, target, extent)
-    trials = [start, once, registered(once, mine.cloud, target, extent)]
 
     def best(motions: Sequence[Motion]) -> Motion:
-        there = seed_costs(mine, surfaces[1 - s].sight, [m.T for m in motions], extent, 0.0).sum(0)
-        back = seed_costs(theirs, surfaces[s].sight, [inverted(m).T for m in motions], extent, 0.0).sum(0)
-        return motions[int((there + back).argmin())]
+        return motions[int(both_ways(_costs_anywhere, (mine, theirs), motions, extent).sum(0).argmin())]
 
-    fit = best(values_around(best(trials), extent))
+    if len(theirs.points) < config.min_points:
+        fit = polished([start], mine, evidence.fresh[1 - s], extent)
+    else:
+        # Against the whole of the other state a drawer would cling to the frame that it slides along.
+        target = surfaces[1 - s].rows(own[1 - s]).cloud
+        once = registered(start, mine.cloud, target, extent)
+        trials = [start, once, registered(once, mine.cloud, target, extent)]
+        fit = best(values_around(best(trials), extent))
     return _climb(evidence, fit if s == 0 else inverted(fit), own, SETTLED, CLEARLY)
 
 
@@ -418,7 +414,7 @@ def polished(trials: Sequence[Motion], mine: Surface, other: Surface, extent: fl
 
 def liked(motions: Sequence[Motion], mine: Surface, other: Sight, extent: float) -> Motion:
     """The best of some motions of a surface, as the other state's cameras judge them; its score says how good."""
-    costs = seed_costs(mine, other, [m.T for m in motions], extent, 0.0).mean(0)
+    costs = _costs_anywhere(mine, other, [m.T for m in motions], extent).mean(0)
     return replace(motions[int(costs.argmin())], score=1 - float(costs.min()))
 
 

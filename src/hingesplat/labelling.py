@@ -10,10 +10,10 @@ from itertools import combinations
 
 import numpy as np
 import torch
-from numba import njit
 from scipy.sparse import csr_matrix
 from scipy.spatial import KDTree
 
+from hingesplat.mean_field import mean_field
 from hingesplat.se3 import moved
 from hingesplat.surface import Labels, Surface, free_share
 from hingesplat.visibility import COLOUR, SURFACE, Sight, ask
@@ -75,10 +75,12 @@ def _priced(
     at_once = max(AT_ONCE // max(len(surface.points), 1), 1)
     for start in range(0, len(labels), at_once):
         some = labels[start : start + at_once]
-        for T, contradiction, arrived, colour in zip(some, *_told(surface, other, some), strict=True):
+        places, *told = _told(surface, other, some)
+        for T, place, contradiction, arrived, colour in zip(some, places, *told, strict=True):
             # To move is a claim: it costs a little, and to be recognised far away costs more.
-            way = 0 if T is None else np.linalg.norm(moved(surface.points, T) - surface.points, axis=1) / extent
-            claim = 0.0 if T is None else 0.05 + far_cost * way * arrived
+            claim = 0.0 if T is None else 0.05
+            if T is not None and far_cost > 0:
+                claim = claim + far_cost * arrived * np.linalg.norm(place - surface.points, axis=1) / extent
             unseen = covered_cost if T is None else hidden_cost
             yield contradiction + arrived * 0.5 * colour + (1 - arrived) * unseen + claim, arrived
 
@@ -89,7 +91,7 @@ def whereabouts(surface: Surface, other: Sight, T: np.ndarray | None = None) -> 
     Returns:
         (n,) bool each. Who is lost may be there, but nobody sees it.
     """
-    ((contradiction,), (arrived,), _) = _told(surface, other, [T])
+    _, (contradiction,), (arrived,), _ = _told(surface, other, [T])
     may = contradiction < 0.1
     return may, may & (arrived < 0.3)
 
@@ -114,26 +116,25 @@ def hidden(surface: Surface, other: Sight, T: np.ndarray | None = None) -> np.nd
 
 def gone(surface: Surface, other: Sight) -> np.ndarray:
     """(n,) bool: points in whose place the other state's photographs show nothing, or another colour."""
-    ((contradiction,), (arrived,), (colour,)) = _told(surface, other, [None])
+    _, (contradiction,), (arrived,), (colour,) = _told(surface, other, [None])
     return ((contradiction >= 0.5) & (arrived < 0.3)) | (arrived * colour > 0.3)
 
 
 def _told(
     surface: Surface, other: Sight, transforms: Sequence[np.ndarray | None]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """What photographs say of points moved by each of the transforms (None: not at all).
 
     Returns:
-        (transforms, n) in 0 … 1 each: seen through, seen, and of another colour.
+        (transforms, n, 3) where they are then; (transforms, n) in 0 … 1 each: seen through, seen, of another colour.
     """
-    points = np.stack([surface.points if T is None else moved(surface.points, T) for T in transforms])
-    answer = ask(points.reshape(-1, 3), np.tile(surface.colours, (len(transforms), 1)), other)
-    answer = answer.reshape(*points.shape[:2], 4)
+    places = moved(surface.points, np.stack([np.eye(4) if T is None else T for T in transforms]))
+    answer = ask(places.reshape(-1, 3), surface.colours, other).reshape(*places.shape[:2], 4)
     # A point a little in front of its surface floats in some photographs of its own state, too.
     contradiction = np.clip((free_share(answer) - surface.free_at_home - SLACK) / CLEAR, 0, 1)
     # Every surface is hidden from most sides: a few views that see it there are enough.
     arrived = np.clip(answer[..., SURFACE] / ARRIVED, 0, 1)
-    return contradiction, arrived, np.clip((answer[..., COLOUR] - SAME) / OTHER, 0, 1)
+    return places, contradiction, arrived, np.clip((answer[..., COLOUR] - SAME) / OTHER, 0, 1)
 
 
 def seed_costs(
@@ -153,7 +154,7 @@ def seed_gains(seeds: Surface, other: Sight, transforms: Sequence[np.ndarray], e
 
 
 def neighbour_weights(points: np.ndarray, colours: np.ndarray, radius: float, k: int = 12) -> csr_matrix:
-    """(n, n) sparse weights of the k nearest points, less for distance and for another colour."""
+    """(n, n) sparse float32 weights of the k nearest points, less for distance and for another colour."""
     n = len(points)
     k = min(k, n - 1)
     distance, index = map(np.asarray, KDTree(points).query(points, k + 1))
@@ -161,7 +162,13 @@ def neighbour_weights(points: np.ndarray, colours: np.ndarray, radius: float, k:
     column = index[:, 1:].ravel()
     difference = np.linalg.norm(colours[row] - colours[column], axis=1)
     weight = np.exp(-((distance[:, 1:].ravel() / radius) ** 2)) * np.exp(-((difference / 0.3) ** 2))
-    return csr_matrix((weight, (row, column)), shape=(n, n))
+    return csr_matrix((weight.astype(np.float32), (row, column)), shape=(n, n))
+
+
+def of_one_mind(values: np.ndarray, weights: csr_matrix) -> np.ndarray:
+    """(n, …) float32 mean of each point's values and its neighbours'."""
+    values = values.astype(np.float32)
+    return (weights @ values + values) / (1 + np.asarray(weights.sum(1), np.float32))
 
 
 @dataclass(frozen=True)
@@ -190,14 +197,14 @@ class Labelling:
         ]
 
     def partners(self, T_1_0: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """(n_s, 1 + motions): the other state's point with which each point coincides under each label, or −1."""
+        """(n_s, 1 + motions) int32: the other state's point with which each point coincides under each label, or −1."""
         result = []
         for s in (0, 1):
             columns = []
             for T in [np.eye(4), *T_1_0]:
                 carried = moved(self.surfaces[s].points, T if s == 0 else np.linalg.inv(T))
                 distance, index = map(np.asarray, self.trees[1 - s].query(carried, workers=torch.get_num_threads()))
-                columns.append(np.where(distance < 0.025 * self.extent, index, -1))
+                columns.append(np.where(distance < 0.025 * self.extent, index, -1).astype(np.int32))
             result.append(np.stack(columns, 1))
         return result
 
@@ -209,12 +216,7 @@ class Labelling:
         A point hears its own costs, its neighbours, and the point of the other state it would coincide with under
         each label: if k carries me there, the one who lives there should be k, too.
         """
-        problems = []
-        for c, p, w in zip(costs, partners, self.weights, strict=True):
-            graph = w.indptr.astype(np.int32), w.indices.astype(np.int32), w.data.astype(np.float32)
-            problems.append((c.astype(np.float32), p.astype(np.int32), *graph))
-        first, second, energy = _mean_field(problems[0], problems[1], self.smoothness, self.consistency, iterations)
-        return (first, second), float(energy)
+        return mean_field(costs, partners, self.weights, self.smoothness, self.consistency, NOBODY, iterations)
 
     def labels(self, T_1_0: Sequence[np.ndarray]) -> Labels:
         """Labels of both states' points under these motions, all of which stay."""
@@ -230,61 +232,6 @@ class Labelling:
             worse = np.delete(own, k + 1, 1).min(1) - own[:, k + 1]
             result[k] = (worse > NEARLY).mean() if len(own) else 0
         return result
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def _update(
-    q, other, costs, partners, start, end, weight, smoothness, consistency, temperature, updated
-):  # pragma: no cover - compiled
-    """``updated`` (n, labels) from both states' present ``q`` and ``other``; the energy of this state."""
-    labels = costs.shape[1]
-    total, half = np.empty(labels, np.float32), np.empty(labels, np.float32)
-    energy = 0.0
-    for i in range(len(costs)):
-        total[:] = 0
-        for e in range(start[i], start[i + 1]):
-            for k in range(labels):
-                total[k] += weight[e] * q[end[e], k]
-        least = np.float32(np.inf)
-        for k in range(labels):
-            partner = partners[i, k]
-            heard = smoothness * total[k] + consistency * (other[partner, k] if partner >= 0 else np.float32(NOBODY))
-            # Each edge is heard from both its ends, so pairs count half.
-            half[k], total[k] = costs[i, k] - np.float32(0.5) * heard, costs[i, k] - heard
-            least = min(least, total[k])
-        share = np.float32(0)
-        for k in range(labels):
-            updated[i, k] = np.exp((least - total[k]) / temperature)
-            share += updated[i, k]
-        for k in range(labels):
-            updated[i, k] /= share
-            energy += updated[i, k] * half[k]
-    return energy
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def _mean_field(problem0, problem1, smoothness, consistency, iterations):  # pragma: no cover - compiled
-    """Labels of each state's points and the energy; a problem: costs, partners, and the graph of neighbours (CSR)."""
-    costs0, partners0, start0, end0, weight0 = problem0
-    costs1, partners1, start1, end1, weight1 = problem1
-    smooth, consistent = np.float32(smoothness), np.float32(consistency)
-    q0, q1 = np.empty_like(costs0), np.empty_like(costs1)
-    for costs, q in ((costs0, q0), (costs1, q1)):
-        for i in range(len(costs)):
-            q[i] = np.exp((costs[i].min() - costs[i]) / np.float32(0.1))
-            q[i] /= q[i].sum()
-    u0, u1 = np.empty_like(q0), np.empty_like(q1)
-    energy = 0.0
-    for iteration in range(iterations):
-        temperature = np.float32(0.15 - 0.1 * iteration / iterations)
-        energy = _update(q0, q1, costs0, partners0, start0, end0, weight0, smooth, consistent, temperature, u0)
-        energy += _update(q1, q0, costs1, partners1, start1, end1, weight1, smooth, consistent, temperature, u1)
-        q0, u0, q1, u1 = u0, q0, u1, q1
-    first, second = np.empty(len(q0), np.int64), np.empty(len(q1), np.int64)
-    for q, label in ((q0, first), (q1, second)):
-        for i in range(len(q)):
-            label[i] = q[i].argmax()
-    return first, second, energy
 
 
 def meeting(partners: Sequence[np.ndarray], owned: Labels) -> np.ndarray:
@@ -314,7 +261,15 @@ class Choices:
 
     def __init__(self, problem: Labelling, T_1_0: Sequence[np.ndarray]) -> None:
         self.problem, self.number = problem, len(T_1_0)
-        self._costs, self._partners = problem.costs(T_1_0), problem.partners(T_1_0)
+        self._costs = [costs.astype(np.float32) for costs in problem.costs(T_1_0)]
+        self._partners = problem.partners(T_1_0)
+        met = [partners >= 0 for partners in self._partners]
+        # What each label would cost a point if its partner and its neighbours agreed; who hides may be anywhere.
+        self._agreed = [
+            of_one_mind(costs - 0.5 * problem.consistency * np.where(m, 1, NOBODY), weights)
+            for costs, m, weights in zip(self._costs, met, problem.weights, strict=True)
+        ]
+        self._seen = [np.where(m, 1, UNMET).astype(np.float32) for m in met]
         self._solutions: dict[frozenset[int], tuple[Labels, float]] = {}
         self._promises: dict[frozenset[int], np.ndarray] = {}
 
@@ -354,6 +309,20 @@ class Choices:
         gain = {k: self._solved(kept)[1] - self._solved(kept | {k})[1] for k in others}
         return dict(sorted(gain.items(), key=lambda item: -item[1]))
 
+    def firsthand(self, kept: frozenset[int]) -> dict[int, float]:
+        """By how much each of these motions explains its points better than the next best, whatever they hear.
+
+        A frame round a hole, and one round another hole in the other state, make a motion that only hearsay speaks for.
+        """
+        labels, columns = self._solved(kept)[0], [0, *(k + 1 for k in sorted(kept))]
+        better = dict.fromkeys(kept, 0.0)
+        for costs, label in zip(self._costs, labels, strict=True):
+            for k in kept:
+                own = costs[label == k + 1]
+                others = own[:, [column for column in columns if column != k + 1]]
+                better[k] += float((others.min(1) - own[:, k + 1]).sum())
+        return better
+
     def labels(self, kept: Sequence[int]) -> Labels:
         """Labels of both states' points: 0 stays, i + 1 is to move by ``kept[i]``."""
         rank = np.zeros(1 + self.number, int)
@@ -364,19 +333,14 @@ class Choices:
     def _promising(self, kept: frozenset[int], prices: np.ndarray) -> list[int]:
         """All motions, those first that the points would gain most by if their partners agreed, less their prices."""
         if kept not in self._promises:
-            labels, consistency = self._solved(kept)[0], self.problem.consistency
-            gain = np.zeros(self.number)
+            labels, gain = self._solved(kept)[0], np.zeros(self.number)
             for s, weights in enumerate(self.problem.weights):
-                costs, partners = self._costs[s], self._partners[s]
                 row, label = np.arange(len(labels[s])), labels[s]
-                met = partners >= 0
-                agree = np.where(met[row, label], labels[1 - s][partners[row, label]] == label, NOBODY)
-                now = costs[row, label] - 0.5 * consistency * agree
-                then = costs - 0.5 * consistency * np.where(met, 1.0, NOBODY)
-                better = (now[:, None] - then)[:, 1:]
-                average = (weights @ better + better) / (1 + weights.sum(1))
-                # Who hides may be anywhere.
-                gain += (np.maximum(np.asarray(average), 0) * np.where(met[:, 1:], 1, UNMET)).sum(0)
+                partner = self._partners[s][row, label]
+                heard = np.where(partner >= 0, labels[1 - s][partner] == label, NOBODY)
+                now = self._costs[s][row, label] - 0.5 * self.problem.consistency * heard
+                better = of_one_mind(now[:, None], weights) - self._agreed[s]
+                gain += (np.maximum(better, 0) * self._seen[s]).sum(0)[1:]
             self._promises[kept] = gain
         return [int(k) for k in np.argsort(prices - self._promises[kept])]
 

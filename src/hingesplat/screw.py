@@ -34,13 +34,22 @@ class Screw:
 
 def screw_to_matrix(screw: Screw) -> Float[np.ndarray, "4 4"]:
     """The motion ``T_b_a`` (4, 4) that a screw stands for."""
-    a, c = screw.axis, screw.pivot
-    K = _cross_matrix(a)
+    return screws_to_matrices(screw.axis[None], screw.pivot[None], np.array([screw.angle]), np.array([screw.slide]))[0]
+
+
+def screws_to_matrices(
+    axes: Float[np.ndarray, "n 3"],
+    pivots: Float[np.ndarray, "n 3"],
+    angles: Float[np.ndarray, " n"],
+    slides: Float[np.ndarray, " n"],
+) -> Float[np.ndarray, "n 4 4"]:
+    """The motions that many screws stand for; fields as those of ``Screw``."""
+    K = _cross_matrices(axes)
     # R − I, with 1 − cos θ = 2 sin²(θ/2), so that far pivots of small angles lose no digits.
-    turn = np.sin(screw.angle) * K + 2 * np.sin(screw.angle / 2) ** 2 * (K @ K)
-    T = np.eye(4)
-    T[:3, :3] += turn
-    T[:3, 3] = screw.slide * a - turn @ c
+    turns = np.sin(angles)[:, None, None] * K + (2 * np.sin(angles / 2) ** 2)[:, None, None] * (K @ K)
+    T = np.tile(np.eye(4), (len(axes), 1, 1))
+    T[:, :3, :3] += turns
+    T[:, :3, 3] = slides[:, None] * axes - (turns @ pivots[:, :, None])[..., 0]
     return T
 
 
@@ -126,5 +135,8 @@ def _unit(axis: ArrayLike) -> np.ndarray:
     return a / length
 
 
-def _cross_matrix(a: np.ndarray) -> np.ndarray:
-    return np.cross(np.eye(3), a)  # K v = a × v
+def _cross_matrices(a: np.ndarray) -> np.ndarray:
+    K = np.zeros((len(a), 3, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        K[:, k, j], K[:, j, k] = a[:, i], -a[:, i]
+    return K  # K v = a × v

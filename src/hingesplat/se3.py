@@ -71,5 +71,10 @@ def apply(T_b_a: Tensor, points_a: Tensor) -> Tensor:
 
 
 def moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
-    """NumPy points (n, 3) under a 4×4 transform."""
-    return points @ T[:3, :3].T + T[:3, 3]
+    """NumPy points (n, 3) under transforms (…, 4, 4): (…, n, 3)."""
+    return points @ T[..., :3, :3].swapaxes(-1, -2) + T[..., None, :3, 3]
+
+
+def apart(points: np.ndarray, T: np.ndarray, other: np.ndarray) -> float:
+    """Mean distance between the places to which two transforms (4, 4) take points (n, 3)."""
+    return float(np.linalg.norm(moved(points, T) - moved(points, other), axis=1).mean())

@@ -14,7 +14,7 @@ import torch
 from numba import njit
 from scipy.ndimage import distance_transform_edt
 
-from hingesplat.screw import joint_motion
+from hingesplat.screw import joint_motion, screws_to_matrices
 from hingesplat.se3 import moved
 from hingesplat.threads import parallel
 from hingesplat.visibility import FREE, SURFACE, Sight, ask
@@ -280,6 +280,16 @@ class Motion:
     def T(self) -> np.ndarray:
         """4×4 from this state's configuration to the other's."""
         return self.after @ joint_motion(self.kind, self.axis, self.pivot, self.value)
+
+
+def there_and_back(motions: Sequence[Motion]) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 4, 4) where every motion takes things from this state to the other, and from there back."""
+    turns = np.array([m.kind == "revolute" for m in motions], bool)
+    values = np.array([m.value for m in motions])
+    axes, pivots = (np.reshape([getattr(m, name) for m in motions], (-1, 3)) for name in ("axis", "pivot"))
+    joint = screws_to_matrices(axes, pivots, np.where(turns, values, 0), np.where(turns, 0, values))
+    there = np.reshape([m.after for m in motions], (-1, 4, 4)) @ joint
+    return there, np.linalg.inv(there)
 
 
 def inverted(motion: Motion) -> Motion:

@@ -16,6 +16,8 @@ from typing import Any
 
 import llvmlite.ir as ir
 import numba.extending
+import numpy as np
+from numba import njit
 from numba.core import cgutils, event, types
 from numba.core.registry import cpu_target
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
@@ -475,6 +477,30 @@ def vmantissa(typingctx, x):
         return builder.bitcast(builder.or_(fraction, one), _VECTOR)
 
     return vector(vector), code
+
+
+# 2^u ≈ E0 + E1·u + … on [-1, 0], minimax fit, error below 1e-7.
+_E0, _E1, _E2, _E3, _E4, _E5 = (
+    np.float32(e)
+    for e in (
+        0.9999999250634352,
+        0.6931422525893657,
+        0.24017218921989097,
+        0.05527972250486135,
+        0.009188611646813588,
+        0.000938788304101934,
+    )
+)
+
+
+@njit(**INLINE)
+def vexp2(e):
+    """2^e for -8 ≤ e ≤ 0, as (2^(e/8))^8; no vector maths library is needed."""
+    u = e * np.float32(0.125)
+    p = vfma(vfma(vfma(vfma(vfma(u, _E5, _E4), u, _E3), u, _E2), u, _E1), u, _E0)
+    p = p * p
+    p = p * p
+    return p * p
 
 
 # ---- several planes at once: tuples of ``build.planes`` vectors, kept in registers ---------------------

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
-from hingesplat.se3 import moved
+from hingesplat.se3 import apart
 
 
 @dataclass(frozen=True)
@@ -43,18 +43,13 @@ def living_slots(
         mine = points[label == k]
         for j in range(k if len(mine) else 0):
             theirs = points[label == j]
-            alike = _apart(mine, T_state_0[:, k], T_state_0[:, j]) < config.same_motion * extent
+            off = max(apart(mine, *pair) for pair in zip(T_state_0[:, k], T_state_0[:, j], strict=True))
+            alike = off < config.same_motion * extent
             if alike and (j == 0 or _touch(mine, theirs, extent)):
                 label[label == k] = j
                 break
     living = [0, *(k for k in range(1, T_state_0.shape[1]) if (label == k).any())]
     return np.searchsorted(living, label), living
-
-
-def _apart(points: np.ndarray, T: np.ndarray, other: np.ndarray) -> float:
-    """Mean distance between where two motions (states, 4, 4) take the points, in the state where it is largest."""
-    off = T - other
-    return float(max(np.linalg.norm(moved(points, M), axis=1).mean() for M in off))
 
 
 def _touch(points: np.ndarray, other: np.ndarray, extent: float) -> bool:

@@ -138,12 +138,12 @@ def _ask(points, colours, P, depth, reach, rgb, tolerance, answer, thread, threa
                         signed = d - s
             if least < tolerance:
                 answer[i, SURFACE] += 1
-                closest = np.float32(3)
+                closest, c = np.float32(3), i % colours.shape[0]
                 for b in range(-1, 2):
                     for a in range(-1, 2):
-                        e0 = rgb[v, w + b, u + a, 0] - colours[i, 0]
-                        e1 = rgb[v, w + b, u + a, 1] - colours[i, 1]
-                        e2 = rgb[v, w + b, u + a, 2] - colours[i, 2]
+                        e0 = rgb[v, w + b, u + a, 0] - colours[c, 0]
+                        e1 = rgb[v, w + b, u + a, 1] - colours[c, 1]
+                        e2 = rgb[v, w + b, u + a, 2] - colours[c, 2]
                         closest = min(closest, e0 * e0 + e1 * e1 + e2 * e2)
                 answer[i, COLOUR] += np.sqrt(closest)
             elif signed < 0:
@@ -155,7 +155,7 @@ def _ask(points, colours, P, depth, reach, rgb, tolerance, answer, thread, threa
 
 
 def ask(points: np.ndarray, colours: np.ndarray, sight: Sight) -> np.ndarray:
-    """What a state's cameras say of points (n, 3) with colours (n, 3).
+    """What a state's cameras say of points (n, 3) with colours (m, 3), which start again where there are fewer.
 
     Returns:
         (n, 4): the number of views in which the point is in free space, on the surface, hidden behind it; and the mean

@@ -12,7 +12,6 @@ from numba import njit
 from hingesplat.render._tiles import REC_A, REC_B, REC_C, REC_FEATURES, REC_LOG_OPACITY, REC_X, REC_Y, TILE
 from hingesplat.render.torch_backend import ALPHA_MAX, ALPHA_MIN
 from hingesplat.simd import (
-    INLINE,
     INNER,
     KERNEL,
     LANES,
@@ -29,6 +28,7 @@ from hingesplat.simd import (
     take_ticket,
     vand,
     vany,
+    vexp2,
     vfma,
     vgt,
     viota,
@@ -44,31 +44,8 @@ PITCH = TILE + LANES
 PLANE = (TILE + 1) * PITCH
 
 _CHECK_EVERY = 32  # segments between looks whether a whole tile is opaque
-_0, _1, _2, _HALF, _EIGHTH = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5), np.float32(0.125)
+_0, _1, _2, _HALF = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5)
 _ALPHA_MAX, _LOG2_ALPHA_MIN = np.float32(ALPHA_MAX), np.float32(math.log2(ALPHA_MIN))
-
-# 2^u ≈ E0 + E1·u + … on [-1, 0], minimax fit, error below 1e-7.
-_E0, _E1, _E2, _E3, _E4, _E5 = (
-    np.float32(e)
-    for e in (
-        0.9999999250634352,
-        0.6931422525893657,
-        0.24017218921989097,
-        0.05527972250486135,
-        0.009188611646813588,
-        0.000938788304101934,
-    )
-)
-
-
-@njit(**INLINE)
-def _exp2(e):
-    """2^e for -8 ≤ e ≤ 0, as (2^(e/8))^8; no vector maths library is needed."""
-    u = e * _EIGHTH
-    p = vfma(vfma(vfma(vfma(vfma(u, _E5, _E4), u, _E3), u, _E2), u, _E1), u, _E0)
-    p = p * p
-    p = p * p
-    return p * p
 
 
 @njit(**INNER)
@@ -105,8 +82,8 @@ def _blend_tile(build, x0, y0, x1, y1, record, stride, items, shapes, start, sto
                 dy1 = dy + _1
                 e0 = vfma(vfma(dy, c, linear), dy, constant)
                 e1 = vfma(vfma(dy1, c, linear), dy1, constant)
-                alpha0 = vselect(vand(vgt(e0, _LOG2_ALPHA_MIN), vgt(t0, floor)), vmin(_exp2(e0), _ALPHA_MAX), _0)
-                alpha1 = vselect(vand(vgt(e1, _LOG2_ALPHA_MIN), vgt(t1, floor)), vmin(_exp2(e1), _ALPHA_MAX), _0)
+                alpha0 = vselect(vand(vgt(e0, _LOG2_ALPHA_MIN), vgt(t0, floor)), vmin(vexp2(e0), _ALPHA_MAX), _0)
+                alpha1 = vselect(vand(vgt(e1, _LOG2_ALPHA_MIN), vgt(t1, floor)), vmin(vexp2(e1), _ALPHA_MAX), _0)
                 w0, w1 = alpha0 * t0, alpha1 * t1
                 vstore(buffer, p, t0 - w0)
                 vstore(buffer, p + PITCH, t1 - w1)
@@ -250,7 +227,7 @@ def _unblend_tile(build, x0, y0, record, stride, items, slots, shapes, start, st
                 for _ in range(2):
                     t = vload(buffer, p)
                     e = vfma(vfma(dy, c, linear), dy, constant)
-                    raw = _exp2(e)
+                    raw = vexp2(e)
                     live = vand(vgt(e, _LOG2_ALPHA_MIN), vgt(t, floor))
                     alpha = vselect(live, vmin(raw, _ALPHA_MAX), _0)
                     weight = alpha * t
