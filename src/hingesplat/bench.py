@@ -12,6 +12,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
+from datetime import date
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -234,7 +235,7 @@ def measure(case: Case, capture: Path | None, home: Path, out: Path) -> Row:
         return row | {"error": error.replace(str(capture), case.subject)}
     if not case.options:
         _keep_picture(run / "summary.png", out / "summaries" / f"{case.name}.jpg")
-    return row | results(run)
+    return row | results(run) | {"recorded": date.today().isoformat()}
 
 
 def results(run: Path) -> Row:

@@ -237,10 +237,11 @@ def candidates(evidence: Evidence, seeds: Sequence[np.ndarray], judges: tuple[np
     for motion in best:
         if all(apart(sample, motion.T, other.T) >= START_APART * e.extent for other in climbing):
             climbing.append(motion)
+    higher: list[Motion] = []
     for near, steps in CLIMB:
-        climbing = [_climbed(e, motion, judges, near, steps) for motion in climbing]
-        climbing = promising(climbing, APART, round(GO_ON * len(climbing)))
-    return promising([*climbing, *pool], APART, e.config.candidates)
+        higher = [_one_round(e, motion, judges, near, steps) for motion in climbing]
+        climbing = promising(higher, APART, round(GO_ON * len(higher)))
+    return promising([*higher, *pool], APART, e.config.candidates)
 
 
 def both_ways(
@@ -290,14 +291,13 @@ def climbed(evidence: Evidence, motion: Motion, seeds: Sequence[np.ndarray]) -> 
     better.
     """
     for near, steps in CLIMB:
-        motion = _climbed(evidence, motion, seeds, near, steps)
+        motion = _one_round(evidence, motion, seeds, near, steps)
     return motion
 
 
-def _climbed(
+def _one_round(
     evidence: Evidence, motion: Motion, seeds: Sequence[np.ndarray], near: float, steps: Sequence[float]
 ) -> Motion:
-    """After one round."""
     own = [_concerned(evidence, s, motion if s == 0 else inverted(motion), seeds[s], near) for s in (0, 1)]
     if min(map(len, own)) < evidence.config.min_concerned:
         return motion

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -352,7 +353,11 @@ def write_page(page: Path, rows: Sequence[Row], out: Path) -> Path:
 
 def _machines(rows: Sequence[Row]) -> list[str]:
     machines = sorted({r["summary"]["machine"] for r in measured(rows)})
-    return [f"Machine: {'; '.join(machines)}."] if machines else ["No run has been recorded yet."]
+    if not machines:
+        return ["No run has been recorded yet."]
+    days = Counter(r.get("recorded", "before that was taken down") for r in measured(rows))
+    runs = ", ".join(f"{day} {n}" for day, n in sorted(days.items()))
+    return [f"Machine: {'; '.join(machines)}. Runs, by the day they were made: {runs}."]
 
 
 def _scale(preset: str, views: int | None, size: int | None) -> str:
