@@ -789,11 +789,11 @@ def test_two_doors_on_one_hinge_line_are_two_parts_and_a_plate_on_its_middle_is_
         assert len(np.unique(found[400:800])) == len(np.unique(found[800:])) == 1
 
 
-@pytest.mark.parametrize(("tall", "parts"), [(0.05, 1), (0.3, 2)])
-def test_what_hides_between_the_halves_of_a_lever_does_not_part_them(tall: float, parts: int) -> None:
+@pytest.mark.parametrize(("tall", "gap", "parts"), [(0.05, 0.12, 1), (0.05, 0.04, 1), (0.3, 0.12, 2)])
+def test_what_hides_between_the_halves_of_a_lever_does_not_part_them(tall: float, gap: float, parts: int) -> None:
     """A blade of scissors is hidden where the other crosses it; two doors back to back are tall, and far apart less."""
     turn = Motion("revolute", np.eye(3)[1], np.zeros(3), 0.4, 1.0)
-    x, y = (grid.ravel() for grid in np.meshgrid(np.arange(0.06, 0.5, 0.01), np.arange(0, tall, 0.01)))
+    x, y = (grid.ravel() for grid in np.meshgrid(np.arange(gap / 2, 0.5, 0.01), np.arange(0, tall, 0.01)))
     half = np.stack([x, y, 0 * x], 1)
     lever, base = np.concatenate([half, half * [-1, 1, 1]]), patch((0, 0, -1), 20)
     surfaces = (plain(np.concatenate([base, lever])), plain(np.concatenate([base, moved(lever, turn.T)])))

@@ -328,18 +328,21 @@ def _correct(
 
 
 def _surface_points(views: Sequence[DepthView], resolution: int) -> np.ndarray:
-    """(n, 3) points on the part's surface, one for each cell of a voxel's size that at least three pixels see.
+    """(n, 3) points on the part's surface, one for each cell of a voxel's or a pixel's size that three pixels see.
 
     Stragglers are left out; without enough of them (16) there are none.
     """
-    seen = []
+    seen, footprints = [], []
     for view in views:
         y, x = np.nonzero(view.own & np.isfinite(view.depth))
-        seen.append(view.camera.lifted(x, y, view.depth[y, x].astype(float)))
+        depth = view.depth[y, x].astype(float)
+        seen.append(view.camera.lifted(x, y, depth))
+        footprints.append(depth / view.camera.fx)
     points = np.concatenate(seen)
     if len(points) < 16:
         return points[:0]
     size = float((np.quantile(points, 0.99, axis=0) - np.quantile(points, 0.01, axis=0)).max()) / resolution
+    size = max(size, float(np.median(np.concatenate(footprints))))  # Finer cells of a small part are seen by chance.
     _, cell, count = np.unique(cubes(points, max(size, 1e-9)), return_inverse=True, return_counts=True)
     mean = np.stack([np.bincount(cell, a) for a in points.T], 1) / count[:, None]
     mean = mean[count >= 3]

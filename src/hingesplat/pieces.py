@@ -23,6 +23,8 @@ HINGE = 0.02
 """Extents from its hinge line within which nothing tells whether a part is one."""
 LINKED = 0.25
 """Links across a hinge line that make one part of what lies on both sides, for every point that it is long."""
+THIN = 0.25
+"""Share of how far both of two pieces reach from their pivot that they share along it: less makes them one lever."""
 GONE = 0.3
 """Share of a part's points that one of the states at least must show to have gone, or four times the fewest of a part:
 a long panel slides over itself."""
@@ -312,18 +314,19 @@ def _cut_at_hinge(
 def _joined_across_pivot(points: np.ndarray, piece: np.ndarray, T: np.ndarray) -> np.ndarray:
     """Pieces (n,) of points (n, 3), the two largest made one if a pivot between them joins them.
 
-    Where a blade of scissors crosses the other, that one hides it. Doors back to back are longer than far apart.
+    Where a blade of scissors crosses the other, that one hides it. Doors back to back are longer along their hinge line
+    than far apart, and not thin beside what they reach from it.
     """
     screw, size = matrix_to_screw(T), np.bincount(piece)
     if screw.angle == 0 or len(size) < 2:
         return piece
     larger, smaller = np.argsort(-size, kind="stable")[:2]
     first, second = points[piece == larger], points[piece == smaller]
-    distance, index = map(np.asarray, KDTree(first).query(second))
-    nearest = int(distance.argmin())
-    a, b = (np.cross(p - screw.pivot, screw.axis) for p in (first[index[nearest]], second[nearest]))
-    shared = _shared_length(first, second, screw.axis)
-    return np.where(piece == smaller, larger, piece) if a @ b < 0 < shared < distance[nearest] else piece
+    gap, shared = KDTree(first).query(second)[0].min(), _shared_length(first, second, screw.axis)
+    a, b = (np.cross(p - screw.pivot, screw.axis) for p in (first, second))
+    reach = min(np.linalg.norm(off, axis=1).max() for off in (a, b))
+    joined = a.mean(0) @ b.mean(0) < 0 < shared < max(gap, THIN * reach)
+    return np.where(piece == smaller, larger, piece) if joined else piece
 
 
 def _shared_length(first: np.ndarray, second: np.ndarray, axis: np.ndarray) -> float:
