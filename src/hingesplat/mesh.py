@@ -34,6 +34,8 @@ MOST = 0.5
 """Share of a part that must lie within the convex hull of what was seen of it for that to be its bound."""
 HOLLOW = 0.2
 """An unseen pocket is empty where more than this share of what borders on it was seen to be."""
+FOOTPRINT = 0.7
+"""Pixels that a cell of a small part's surface is wide at least."""
 
 
 @dataclass(frozen=True)
@@ -328,7 +330,7 @@ def _correct(
 
 
 def _surface_points(views: Sequence[DepthView], resolution: int) -> np.ndarray:
-    """(n, 3) points on the part's surface, one for each cell of a voxel's or a pixel's size that three pixels see.
+    """(n, 3) points on the part's surface, one for each cell of a voxel's size that at least three pixels see.
 
     Stragglers are left out; without enough of them (16) there are none.
     """
@@ -342,7 +344,7 @@ def _surface_points(views: Sequence[DepthView], resolution: int) -> np.ndarray:
     if len(points) < 16:
         return points[:0]
     size = float((np.quantile(points, 0.99, axis=0) - np.quantile(points, 0.01, axis=0)).max()) / resolution
-    size = max(size, float(np.median(np.concatenate(footprints))))  # Finer cells of a small part are seen by chance.
+    size = max(size, FOOTPRINT * float(np.median(np.concatenate(footprints))))  # Finer cells are seen only by chance.
     _, cell, count = np.unique(cubes(points, max(size, 1e-9)), return_inverse=True, return_counts=True)
     mean = np.stack([np.bincount(cell, a) for a in points.T], 1) / count[:, None]
     mean = mean[count >= 3]
