@@ -146,7 +146,7 @@ def test_the_surface_of_a_small_part_has_no_holes() -> None:
     """Its pixels are wider than a 128th of it: cells that small are seen three times only by chance."""
     box = trimesh.creation.box((0.2, 0.2, 0.2))
     points = _surface_points([traced(camera, box) for camera in sphere_of_cameras(24)], 128)
-    assert KDTree(points).query(box.sample(2000, seed=0))[0].max() < 0.03  # Pixels are 0.026 wide there.
+    assert KDTree(points).query(box.sample(2000, seed=0))[0].max() < 0.05  # Pixels are 0.026 wide there.
 
 
 def test_parts_of_a_scene_in_two_states_come_back_apart_closed_and_coloured():
