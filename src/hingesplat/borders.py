@@ -11,7 +11,7 @@ import numpy as np
 from scipy.sparse import block_array, coo_matrix, csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
-from hingesplat.labelling import Labelling, Whereabouts
+from hingesplat.labelling import Labelling, Whereabouts, of_one_mind
 from hingesplat.screw import slide_of
 from hingesplat.surface import Labels
 
@@ -40,7 +40,7 @@ def bordered(T_1_0: Sequence[np.ndarray], owned: Labels, problem: Labelling, tol
         kind = "revolute" if slide_of([T]) is None else "prismatic"
         # Of a bar that slides along itself few points, its ends, know; of a hub none, but noise.
         if kind == "revolute":
-            worse = (links @ worse + worse) / (np.asarray(links.sum(1)).ravel() + 1)
+            worse = of_one_mind(worse[:, None], links)[:, 0]
         stays = (owner == 0) & (worse >= STAYS[kind])
         loose = np.flatnonzero((owner == 0) & ~lost & ~stays)
         labels[loose[_cut(links, loose, stays, owner == k)]] = k

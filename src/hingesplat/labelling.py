@@ -166,9 +166,8 @@ def neighbour_weights(points: np.ndarray, colours: np.ndarray, radius: float, k:
 
 
 def of_one_mind(values: np.ndarray, weights: csr_matrix) -> np.ndarray:
-    """(n, …) float32 mean of each point's values and its neighbours'."""
-    values = values.astype(np.float32)
-    return (weights @ values + values) / (1 + np.asarray(weights.sum(1), np.float32))
+    """(n, k) mean of each point's values (n, k) and its neighbours'."""
+    return (weights @ values + values) / (1 + np.asarray(weights.sum(1)).reshape(-1, 1))
 
 
 @dataclass(frozen=True)
@@ -266,7 +265,7 @@ class Choices:
         met = [partners >= 0 for partners in self._partners]
         # What each label would cost a point if its partner and its neighbours agreed; who hides may be anywhere.
         self._agreed = [
-            of_one_mind(costs - 0.5 * problem.consistency * np.where(m, 1, NOBODY), weights)
+            of_one_mind((costs - 0.5 * problem.consistency * np.where(m, 1, NOBODY)).astype(np.float32), weights)
             for costs, m, weights in zip(self._costs, met, problem.weights, strict=True)
         ]
         self._seen = [np.where(m, 1, UNMET).astype(np.float32) for m in met]
@@ -339,7 +338,7 @@ class Choices:
                 partner = self._partners[s][row, label]
                 heard = np.where(partner >= 0, labels[1 - s][partner] == label, NOBODY)
                 now = self._costs[s][row, label] - 0.5 * self.problem.consistency * heard
-                better = of_one_mind(now[:, None], weights) - self._agreed[s]
+                better = of_one_mind(now[:, None].astype(np.float32), weights) - self._agreed[s]
                 gain += (np.maximum(better, 0) * self._seen[s]).sum(0)[1:]
             self._promises[kept] = gain
         return [int(k) for k in np.argsort(prices - self._promises[kept])]

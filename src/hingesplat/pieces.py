@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 
 from hingesplat.labelling import HIDDEN_COST, Whereabouts, gone, label_costs
 from hingesplat.screw import matrix_to_screw
-from hingesplat.se3 import moved
+from hingesplat.se3 import apart, moved
 from hingesplat.search import Motion
 from hingesplat.surface import Labels, Surface, components
 
@@ -100,8 +100,8 @@ def _rejoined(motions: Sequence[Motion], owned: Labels, surfaces: tuple[Surface,
             points = surfaces[s].points[mine[s]]
             for j, other in enumerate(motions):
                 theirs = surfaces[s].points[owned[s] == j + 1]
-                ends = [moved(points, T if s == 0 else np.linalg.inv(T)) for T in (motion.T, other.T)]
-                alike = np.linalg.norm(ends[0] - ends[1], axis=1).mean() < 0.03 * extent
+                first, second = (T if s == 0 else np.linalg.inv(T) for T in (motion.T, other.T))
+                alike = apart(points, first, second) < 0.03 * extent
                 if j != k and alike and len(theirs) and KDTree(theirs).query(points)[0].min() < 0.03 * extent:
                     for state in (0, 1):
                         labels[state][mine[state]] = j + 1
