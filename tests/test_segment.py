@@ -565,6 +565,29 @@ def test_what_others_explain_nearly_as_well_is_not_explained_at_first_hand(turne
     assert max(choices.firsthand(frozenset({0, 1})).values()) < 0.1 * PRICE
 
 
+def test_more_motions_to_choose_from_are_as_if_they_had_been_there_from_the_first(turned: Turned) -> None:
+    """What was worked out before stays true, and the motions that come later are chosen as well."""
+    _, surfaces, extent = turned
+    problem, into_the_box = Labelling.of(surfaces, extent), prismatic(FORWARD, -0.5 * extent)
+    few = Choices(problem, [into_the_box])
+    assert few.gains(frozenset()).keys() == {0}
+    grown, whole = few.with_more([TURN.T]), Choices(problem, [into_the_box, TURN.T])
+    assert grown.best(np.full(2, float(PRICE)), None) == {1}
+    for kept in ([], [0], [1], [0, 1]):
+        assert grown.gains(frozenset(kept)) == pytest.approx(whole.gains(frozenset(kept)))
+        np.testing.assert_array_equal(grown.labels(kept)[0], whole.labels(kept)[0])
+    assert few.with_more([]) is few
+
+
+def test_an_odd_joint_costs_more(turned: Turned) -> None:
+    """Of two motions that explain the same, the one that no hinge would make is not chosen."""
+    _, surfaces, extent = turned
+    choices = Choices(Labelling.of(surfaces, extent), [TURN.T, TURN.T])
+    for odd in (0, 1):
+        price = np.where(np.arange(2) == odd, 30.0, 20.0)
+        assert told_apart(choices, lambda *_: 0.0, price, None) == {1 - odd: 20}
+
+
 def test_texture_is_asked_about_what_is_chosen_and_may_have_it_replaced(turned: Turned) -> None:
     """Of two motions that explain the same, one is chosen; that texture speaks against it brings in the other."""
     _, surfaces, extent = turned

@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 
 from hingesplat.chains import misfit
 from hingesplat.labelling import WORTH, seed_costs, seed_gains
+from hingesplat.mechanism import oddity
 from hingesplat.register import register
 from hingesplat.screw import axes_across, matrix_to_screw
 from hingesplat.se3 import apart, moved
@@ -43,6 +44,10 @@ CLIMB = ((0.06, (0.03, 0.015)), (0.03, (0.015, 0.007)), (0.015, (0.007, 0.0035))
 """Extents within which seeds are heard beside those that meet, and steps, one round after the other."""
 SETTLED, CLEARLY = (0.015, 0.007), 0.01
 """Steps of a motion that has been registered, and by how much each must better a point's cost in the mean."""
+GAINED = 0.3
+"""By how much a motion must explain a seed better than ``WORTH`` for it to be one that it moves."""
+IMPOSSIBLE = 3.0
+"""Oddity from which a motion is none."""
 GO_ON = 0.5
 """Share of those that climb, the most promising, that go on after each round."""
 STEPS, ANYWHERE = 6, 6
@@ -241,7 +246,24 @@ def candidates(evidence: Evidence, seeds: Sequence[np.ndarray], judges: tuple[np
     for near, steps in CLIMB:
         higher = [_one_round(e, motion, judges, near, steps) for motion in climbing]
         climbing = promising(higher, APART, round(GO_ON * len(higher)))
-    return promising([*higher, *pool], APART, e.config.candidates)
+    found = promising([*higher, *pool], APART, 2 * e.config.candidates)
+    possible = [m for m, odd in zip(found, oddities(e, found, judges), strict=True) if odd < IMPOSSIBLE]
+    return possible[: e.config.candidates]
+
+
+def oddities(evidence: Evidence, motions: Sequence[Motion], seeds: Sequence[np.ndarray]) -> np.ndarray:
+    """(motions,) ``oddity`` of each, by those of the seeds (rows of each state's points) that it explains."""
+    first, second = evidence.seen(seeds)
+    result = np.zeros(len(motions))
+    gains = both_ways(seed_gains, (first, second), motions, evidence.extent)
+    for k, motion in enumerate(motions):
+        there, back = np.split(gains[:, k] > GAINED, [len(first.points)])
+        T_0_1 = np.linalg.inv(motion.T)
+        points = np.concatenate([first.points[there], moved(second.points[back], T_0_1)])
+        normals = np.concatenate([first.normals[there], second.normals[back] @ T_0_1[:3, :3].T])
+        flat = plates(points, normals, evidence.extent, np.random.default_rng(0)) if motion.kind == "prismatic" else []
+        result[k] = oddity(motion, points, points[flat[0]] if flat else points[:0], evidence.extent)
+    return result
 
 
 def both_ways(

@@ -5,6 +5,7 @@ A point's cost under a motion is what the other state's photographs say of the p
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -272,6 +273,18 @@ class Choices:
         self._solutions: dict[frozenset[int], tuple[Labels, float]] = {}
         self._promises: dict[frozenset[int], np.ndarray] = {}
 
+    def with_more(self, T_1_0: Sequence[np.ndarray]) -> "Choices":
+        """The same motions to choose from, and some more after them."""
+        if len(T_1_0) == 0:
+            return self
+        both, more = copy(self), Choices(self.problem, T_1_0)
+        both.number = self.number + more.number
+        for name in ("_costs", "_partners", "_agreed", "_seen"):
+            columns = zip(getattr(self, name), getattr(more, name), strict=True)
+            setattr(both, name, [np.concatenate([mine, theirs[:, 1:]], 1) for mine, theirs in columns])
+        both._promises = {}
+        return both
+
     def _solved(self, kept: frozenset[int]) -> tuple[Labels, float]:
         """Labels that are columns of the costs, and their energy."""
         if kept not in self._solutions:
@@ -304,9 +317,13 @@ class Choices:
 
     def gains(self, kept: frozenset[int]) -> dict[int, float]:
         """What each of the most promising others would explain besides these, in points; the best first."""
-        others = [k for k in self._promising(kept, np.zeros(self.number)) if k not in kept][:ADDED]
+        others = self.promising(kept)[:ADDED]
         gain = {k: self._solved(kept)[1] - self._solved(kept | {k})[1] for k in others}
         return dict(sorted(gain.items(), key=lambda item: -item[1]))
+
+    def promising(self, kept: frozenset[int]) -> list[int]:
+        """All others, those first by which points would gain most besides these."""
+        return [k for k in self._promising(kept, np.zeros(self.number)) if k not in kept]
 
     def firsthand(self, kept: frozenset[int]) -> dict[int, float]:
         """By how much each of these motions explains its points better than the next best, whatever they hear.

@@ -23,6 +23,7 @@ from hingesplat.hypotheses import (
     HypothesesConfig,
     both_ways,
     candidates,
+    oddities,
     propose_hanging,
     refit,
 )
@@ -71,6 +72,10 @@ that became the frame round another 0.2."""
 DISCOUNT = 2.5
 """Part of a price, for all of the patches asked, that texture pays: 16 and 25 % of those of drawers went along, 9 and
 10 % of those of handles that were alike."""
+RIVALS = 6
+"""Motions that are heard in place of each of the best, and of each two of them."""
+STAYS = 0.8
+"""Share of its price for which a motion stays that was chosen among all: what is worth just that would come and go."""
 MEETING = 0.5
 """Share of a part's points that must meet its points of the other state, in one of the states."""
 PASSED_ON, RIDING = 0.5, 0.6
@@ -210,8 +215,7 @@ def segment(
 
     case = _Case.of(evidence, judges, config, parts)
     photographs = [photographs_of(g, v, config.texture) for g, v in zip(gaussians, views, strict=True)]
-    prices = case.told_by_texture(found, photographs, seed)
-    chosen = case.settled([found[k] for k in prices], list(prices.values()))
+    chosen = case.settled(*case.told_by_texture(found, photographs, seed))
     chosen = case.with_hanging(chosen)
     chosen = case.without_still(chosen, photographs, seed)
     if not any(carrier_of(m, chosen) is not None for m in chosen):
@@ -253,9 +257,12 @@ class _Case:
 
     def told_by_texture(
         self, motions: Sequence[Motion], photographs: Sequence[Sequence[Photograph]], seed: int
-    ) -> dict[int, float]:
-        """Which of the motions there are, and their prices: look-alikes told apart, and what is nearly alike."""
+    ) -> tuple[list[Motion], list[float]]:
+        """Those of the motions that there are, and what they cost: look-alikes told apart, and what is nearly alike."""
         surfaces, extent, price = self.problem.surfaces, self.evidence.extent, self.config.part_cost
+        choices = Choices(self.problem, [m.T for m in motions])
+        rivals = self._rivals(choices, motions)
+        choices, motions = choices.with_more([m.T for m in rivals]), [*motions, *rivals]
         ways = [m.T for m in motions]
         texture = self._texture_under(ways, photographs, seed)
 
@@ -269,11 +276,29 @@ class _Case:
             points = surfaces[0].points[mine[0]]
             return any(alike(points, ways[j], ways[k], extent) for j in others)
 
-        choices = Choices(self.problem, ways)
-        told = told_apart(choices, verdict, price, self.parts)
-        return vouched_for(
+        told = told_apart(choices, verdict, self._prices(motions), self.parts)
+        prices = vouched_for(
             choices, told, nearly_alike, lambda *asked: likeness(texture(*asked)), LEAST * price, self.parts
         )
+        return [motions[k] for k in prices], [STAYS * p for p in prices.values()]
+
+    def _prices(self, motions: Sequence[Motion]) -> np.ndarray:
+        """(motions,) what each costs before texture is asked, in points: odd joints more."""
+        return self.config.part_cost * (1 + oddities(self.evidence, motions, self.seeds))
+
+    def _rivals(self, choices: Choices, motions: Sequence[Motion]) -> list[Motion]:
+        """What might stand in place of one or two of the best motions, each fitted to what would be its own then.
+
+        Look-alikes that meet by chance meet at once; a right motion that is 2 % off explains less than they do.
+        """
+        kept = choices.best(self._prices(motions), self.parts)
+        found: dict[int, Motion] = {}
+        for out in [*combinations(sorted(kept), 1), *combinations(sorted(kept), 2)]:
+            less = kept - set(out)
+            for k in [k for k in choices.promising(less) if k not in kept][:RIVALS]:
+                if k not in found:
+                    found[k] = refit(self.evidence, motions[k], self._owned(choices, [*sorted(less), k])[-1])
+        return list(found.values())
 
     def _texture_under(
         self, ways: Sequence[np.ndarray], photographs: Sequence[Sequence[Photograph]], seed: int

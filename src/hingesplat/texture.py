@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
 from hingesplat.capture import View
 from hingesplat.capture.images import downsampled
@@ -57,7 +58,7 @@ class TextureConfig:
 
 
 def told_apart(
-    choices: Choices, verdict: Callable[[int, Pair], float], price: float, parts: int | None
+    choices: Choices, verdict: Callable[[int, Pair], float], price: ArrayLike, parts: int | None
 ) -> dict[int, float]:
     """The motions that explain both states at the least description length, texture counting, and their prices.
 
@@ -68,13 +69,14 @@ def told_apart(
     Args:
         verdict: what texture says, in points, against the motion of this number, which owns these points (n,) bool of
             each state.
-        price: of each motion, in points.
+        price: of each motion, in points, or of every one.
         parts: choose no more than this many.
     """
-    if not choices.best(np.full(choices.number, price, float), parts):
-        price, parts = LEAST * price, 1
+    usual = np.broadcast_to(np.asarray(price, float), choices.number)
+    if not choices.best(usual, parts):
+        usual, parts = LEAST * usual, 1
     said: dict[int, float] = {}
-    prices = np.full(choices.number, price, float)
+    prices = usual
     while True:
         kept = sorted(choices.best(prices, parts))
         new = [k for k in kept if k not in said]
@@ -84,11 +86,12 @@ def told_apart(
         for k in new:
             mine = kept.index(k) + 1
             said[k] = verdict(k, (first == mine, second == mine))
-        if max(said.values()) <= DOUBT * price:
-            return dict.fromkeys(kept, price)
+        if all(against <= DOUBT * usual[k] for k, against in said.items()):
+            return {k: float(usual[k]) for k in kept}
         # What has not been asked about may be as good as any.
-        prices[:] = LEAST * price
-        prices[list(said)] = np.clip(price + np.array(list(said.values())), LEAST * price, MOST * price)
+        prices = LEAST * usual
+        for k, against in said.items():
+            prices[k] = np.clip(usual[k] + against, LEAST * usual[k], MOST * usual[k])
 
 
 def vouched_for(
