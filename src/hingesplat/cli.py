@@ -84,8 +84,8 @@ class View:
         from hingesplat.viewer import open_viewer
 
         with open_viewer(self.folder, host=self.host, port=self.port, masks=self.masks) as viewer:
-            console.print(f"{viewer.url} shows {escape(str(self.folder))}; Ctrl-C ends it", soft_wrap=True)
-            with suppress(KeyboardInterrupt):
+            with suppress(KeyboardInterrupt):  # From the moment on that the user is told of it.
+                console.print(f"{viewer.url} shows {escape(str(self.folder))}; Ctrl-C ends it", soft_wrap=True)
                 threading.Event().wait()
 
 
