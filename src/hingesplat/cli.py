@@ -83,10 +83,10 @@ class View:
     def run(self, console: Console) -> None:
         from hingesplat.viewer import open_viewer
 
-        with open_viewer(self.folder, host=self.host, port=self.port, masks=self.masks) as viewer:
-            with suppress(KeyboardInterrupt):  # From the moment on that the user is told of it.
-                console.print(f"{viewer.url} shows {escape(str(self.folder))}; Ctrl-C ends it", soft_wrap=True)
-                threading.Event().wait()
+        viewing = open_viewer(self.folder, host=self.host, port=self.port, masks=self.masks)
+        with viewing as viewer, suppress(KeyboardInterrupt):  # From the moment on that the user is told of it.
+            console.print(f"{viewer.url} shows {escape(str(self.folder))}; Ctrl-C ends it", soft_wrap=True)
+            threading.Event().wait()
 
 
 @dataclass(frozen=True)
