@@ -255,6 +255,8 @@ def oddities(evidence: Evidence, motions: Sequence[Motion], seeds: Sequence[np.n
     """(motions,) ``oddity`` of each, by those of the seeds (rows of each state's points) that it explains."""
     first, second = evidence.seen(seeds)
     result = np.zeros(len(motions))
+    if not motions:
+        return result
     gains = both_ways(seed_gains, (first, second), motions, evidence.extent)
     for k, motion in enumerate(motions):
         there, back = np.split(gains[:, k] > GAINED, [len(first.points)])

@@ -260,9 +260,10 @@ class _Case:
     ) -> tuple[list[Motion], list[float]]:
         """Those of the motions that there are, and what they cost: look-alikes told apart, and what is nearly alike."""
         surfaces, extent, price = self.problem.surfaces, self.evidence.extent, self.config.part_cost
-        choices = Choices(self.problem, [m.T for m in motions])
-        rivals = self._rivals(choices, motions)
+        choices, usual = Choices(self.problem, [m.T for m in motions]), self._prices(motions)
+        rivals = self._rivals(choices, motions, usual)
         choices, motions = choices.with_more([m.T for m in rivals]), [*motions, *rivals]
+        usual = np.concatenate([usual, self._prices(rivals)])
         ways = [m.T for m in motions]
         texture = self._texture_under(ways, photographs, seed)
 
@@ -276,7 +277,7 @@ class _Case:
             points = surfaces[0].points[mine[0]]
             return any(alike(points, ways[j], ways[k], extent) for j in others)
 
-        told = told_apart(choices, verdict, self._prices(motions), self.parts)
+        told = told_apart(choices, verdict, usual, self.parts)
         prices = vouched_for(
             choices, told, nearly_alike, lambda *asked: likeness(texture(*asked)), LEAST * price, self.parts
         )
@@ -286,12 +287,12 @@ class _Case:
         """(motions,) what each costs before texture is asked, in points: odd joints more."""
         return self.config.part_cost * (1 + oddities(self.evidence, motions, self.seeds))
 
-    def _rivals(self, choices: Choices, motions: Sequence[Motion]) -> list[Motion]:
+    def _rivals(self, choices: Choices, motions: Sequence[Motion], prices: np.ndarray) -> list[Motion]:
         """What might stand in place of one or two of the best motions, each fitted to what would be its own then.
 
         Look-alikes that meet by chance meet at once; a right motion that is 2 % off explains less than they do.
         """
-        kept = choices.best(self._prices(motions), self.parts)
+        kept = choices.best(prices, self.parts)
         found: dict[int, Motion] = {}
         for out in [*combinations(sorted(kept), 1), *combinations(sorted(kept), 2)]:
             less = kept - set(out)
