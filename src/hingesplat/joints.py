@@ -25,7 +25,7 @@ from hingesplat.poses import (
     pose_step,
     state_loss,
 )
-from hingesplat.screw import axes_across
+from hingesplat.screw import axes_across, distances_to_line
 from hingesplat.se3 import from_Rt, rotvec_to_matrix
 from hingesplat.stereo import DepthMap
 from hingesplat.symmetry import round_about
@@ -367,7 +367,7 @@ def _shared_errors(g: Gaussians, training: Sequence[Sequence[TrainingView]], pos
     for j, turns in enumerate(poses.revolute.cpu().tolist()):
         points = g.means[g.part == j + 1].cpu().double().numpy()
         spread = math.sqrt(points.var(0).sum()) / poses.extent if len(points) else 1.0
-        across = np.linalg.norm(np.cross(points - pivots[j], axes[j]), axis=1) / poses.extent
+        across = distances_to_line(points, pivots[j], axes[j]) / poses.extent
         lever = math.sqrt(np.mean(across**2)) if len(points) else spread
         variance[j, :2] = (ALONG * pixel / max(spread, 1e-9)) ** 2 / 2
         variance[j, 2:4] = (ACROSS * pixel) ** 2 / 2

@@ -7,6 +7,7 @@ is. But no hinge would turn it so, and no rail lead there.
 import numpy as np
 from jaxtyping import Float
 
+from hingesplat.screw import distances_to_line
 from hingesplat.search import Motion
 
 AWAY = 0.15
@@ -37,8 +38,7 @@ def oddity(motion: Motion, points: Float[np.ndarray, "n 3"], plate: Float[np.nda
 
 def off_hinge(motion: Motion, points: Float[np.ndarray, "n 3"]) -> float:
     """How far from its line a hinge leaves the nearest of some points."""
-    away = np.linalg.norm(np.cross(points - motion.pivot, motion.axis), axis=1)
-    return float(np.quantile(away, NEAREST))
+    return float(np.quantile(distances_to_line(points, motion.pivot, motion.axis), NEAREST))
 
 
 def slantwise(motion: Motion, plate: Float[np.ndarray, "n 3"]) -> float:

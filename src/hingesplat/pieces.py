@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from hingesplat.labelling import HIDDEN_COST, Whereabouts, gone, label_costs
-from hingesplat.screw import matrix_to_screw
+from hingesplat.screw import distances_to_line, matrix_to_screw
 from hingesplat.se3 import apart, moved
 from hingesplat.search import Motion
 from hingesplat.surface import Labels, Surface, components
@@ -298,7 +298,7 @@ def _cut_at_hinge(
     the points are apart. A plate that turns about its middle is linked all along that line.
     """
     screw = matrix_to_screw(T)
-    far = np.linalg.norm(np.cross(points - screw.pivot, screw.axis), axis=1) > HINGE * extent
+    far = distances_to_line(points, screw.pivot, screw.axis) > HINGE * extent
     if screw.angle == 0 or not far.any():
         return piece
     cut = components(points[far], radius, bridges=False)[KDTree(points[far]).query(points)[1]]

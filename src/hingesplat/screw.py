@@ -111,6 +111,13 @@ def line_distance(p: ArrayLike, d: ArrayLike, q: ArrayLike, e: ArrayLike) -> flo
     return float(abs(between @ normal) / length)
 
 
+def distances_to_line(
+    points: Float[np.ndarray, "n 3"], pivot: Float[np.ndarray, " 3"], axis: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, " n"]:
+    """How far points are from the line through ``pivot`` along a unit axis."""
+    return np.linalg.norm(np.cross(points - pivot, axis), axis=1)
+
+
 def axes_across(axis: np.ndarray) -> Float[np.ndarray, "2 3"]:
     """Two unit vectors that make a right-handed frame with a unit axis (3,) before them."""
     u = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial import KDTree
 
-from hingesplat.screw import revolute
+from hingesplat.screw import distances_to_line, revolute
 from hingesplat.se3 import moved
 
 TURNS_DEG = (29.0, 61.0, 104.0, 163.0)
@@ -21,7 +21,7 @@ def round_about(points: np.ndarray, axis: np.ndarray, pivot: np.ndarray) -> bool
     """
     if len(points) < 50:
         return False
-    radius = float(np.quantile(np.linalg.norm(np.cross(points - pivot, axis), axis=1), 0.95))
+    radius = float(np.quantile(distances_to_line(points, pivot, axis), 0.95))
     tree = KDTree(points)
     spacing = float(np.quantile(np.asarray(tree.query(points, 2)[0])[:, 1], 0.9))
     for turn in np.radians(TURNS_DEG):
