@@ -23,7 +23,7 @@ from hingesplat.errors import HingesplatError
 from hingesplat.export import FORMATS, ExportConfig, export_twin
 from hingesplat.export.check import Check, check_export, simulation, sweep
 from hingesplat.export.links import UP, build_links, touching
-from hingesplat.export.obj import bake, write_obj
+from hingesplat.export.obj import bake, obj_files
 from hingesplat.export.solids import closed_mesh, collision_hulls, colours, manifold
 from hingesplat.export.splats import read_ply, transformed, write_ply
 from hingesplat.gaussians import Gaussians, posed
@@ -491,7 +491,8 @@ def test_the_texture_shows_what_the_vertex_colours_do():
 
 def test_an_obj_keeps_its_colours(tmp_path: Path):
     ball = gaudy_ball()
-    write_obj(ball, tmp_path / "ball.obj")
+    for name, content in obj_files(ball, "ball").items():
+        (tmp_path / name).write_bytes(content)
     rows = [line.split() for line in (tmp_path / "ball.obj").read_text().splitlines()]
     vertex = np.array([[float(x) for x in r[4:]] for r in rows if r[0] == "v"])
     assert vertex == pytest.approx(colours(ball) / 255, abs=1e-3)

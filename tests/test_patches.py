@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from card import CARD, photographs, place
-from hingesplat.patches import PatchConfig, Patches, _agreed, _seen, adjust, patches_of, shown
+from hingesplat.patches import PatchConfig, Patches, _agreed, adjust, looks, patches_of, shown
 from scenes import FORWARD
 
 CONFIG = PatchConfig(per_part=60)
@@ -64,7 +64,7 @@ def test_light_does_not_matter() -> None:
         replace(
             p,
             spline=((0.4 + 0.01 * i) * p.spline + right + 0.1).astype(np.float32),
-            slope=(0.4 + 0.01 * i) * p.slope + np.array([right[1], 0])[:, None, None],
+            slope=((0.4 + 0.01 * i) * p.slope + np.array([right[1], 0])[:, None, None]).astype(np.float32),
         )
         for i, p in enumerate(second)
     ]
@@ -87,13 +87,19 @@ def test_without_texture_or_photographs_what_was_known_remains() -> None:
 def test_derivatives_of_grey_values() -> None:
     found, photo, T = patches("revolute"), photographs("revolute")[1][3], place("revolute")
     rows = np.flatnonzero(shown(found, T(np.zeros(3))[1], photo, 0.02))[:10]
+    found = replace(found, **{k: getattr(found, k)[rows] for k in ("points", "normals", "grid")})
     still, eps = np.zeros((len(rows), 3)), 1e-4
+    slopes = np.stack([(T(d)[1] - T(-d)[1]) / (2 * eps) for d in eps * np.eye(3)])
+
+    def seen(local: np.ndarray, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        patch, _, texture, jacobian = looks(found, local, [[photo]], T(theta)[1:], slopes[None], 0.03)
+        np.testing.assert_array_equal(patch, np.arange(len(rows)))
+        return texture, jacobian
 
     def grey(local: np.ndarray, theta: np.ndarray) -> np.ndarray:
-        return _seen(found, rows, local, photo, T(theta)[1], np.zeros((3, 4, 4)))[0]
+        return seen(local, theta)[0]
 
-    slopes = np.stack([(T(d)[1] - T(-d)[1]) / (2 * eps) for d in eps * np.eye(3)])
-    jacobian = _seen(found, rows, still, photo, T(np.zeros(3))[1], slopes)[1]
+    jacobian = seen(still, np.zeros(3))[1]
     for k, d in enumerate(eps * np.eye(3)):
         by_local = (grey(still + d, np.zeros(3)) - grey(still - d, np.zeros(3))) / (2 * eps)
         by_joint = (grey(still, d) - grey(still, -d)) / (2 * eps)

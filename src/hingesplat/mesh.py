@@ -380,10 +380,8 @@ def _hull_distance(cloud: np.ndarray, lower: np.ndarray, shape: tuple[int, int, 
     core, grown = (_within(equations + np.array([0, 0, 0, -margin]), columns, shape[2]) for margin in (-3, 3))
     rim = np.argwhere(grown & ~core)
     distance = np.where(core, -np.inf, np.inf).astype(np.float32)
-    nearest = np.full(len(rim), -np.inf)
-    for *normal, offset in equations:
-        np.maximum(nearest, rim @ np.array(normal) + offset, out=nearest)
-    distance[tuple(rim.T)] = nearest
+    some = np.array_split(rim.astype(float), len(rim) // 4096 + 1)  # in the cache, all facets at once
+    distance[tuple(rim.T)] = np.concatenate([(r @ equations[:, :3].T + equations[:, 3]).max(1) for r in some])
     return distance
 
 

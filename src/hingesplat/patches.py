@@ -6,19 +6,21 @@ to light: a patch's level, slopes and contrast are left out. That is bundle adju
 normalised intensities for residuals; the patches' own numbers are eliminated (Schur complement).
 """
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from numba import njit
 from scipy import ndimage
 from torch import Tensor
 
 from hingesplat.camera import Camera
 from hingesplat.render import Rendering
 from hingesplat.screw import axes_across
-from hingesplat.se3 import moved
+from hingesplat.simd import INLINE, KERNEL
 from hingesplat.surface import thin
+from hingesplat.threads import parallel
 
 LEAST_FACING = 0.4
 """Cosine between a patch's normal and the way to a camera that may judge it."""
@@ -78,15 +80,10 @@ class Photograph:
         spline = ndimage.spline_filter(grey, order=3).astype(np.float32)
         return cls(camera, spline, np.stack([right, down]), depth, part.astype(np.int16))
 
-    def intensities(self, at: np.ndarray) -> np.ndarray:
-        """Grey values at pixel positions (…, 2)."""
-        where = [at[..., 1] - 0.5, at[..., 0] - 0.5]
-        return ndimage.map_coordinates(self.spline, where, order=3, prefilter=False, mode="nearest")
-
-    def slopes(self, at: np.ndarray) -> np.ndarray:
-        """(…, 2) how grey values change along x and y at pixel positions (…, 2)."""
-        where = [at[..., 1] - 0.5, at[..., 0] - 0.5]
-        return np.stack([ndimage.map_coordinates(s, where, order=1, mode="nearest") for s in self.slope], -1)
+    @property
+    def intrinsics(self) -> tuple[float, float, float, float]:
+        """Of its camera, as kernels take them."""
+        return self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy
 
     def there(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Depth and part at pixel positions (…, 2); part −1 outside."""
@@ -119,6 +116,7 @@ class Patches:
         a, b = (cell.ravel() for cell in np.meshgrid(*[np.arange(-reach, reach + 1) * pixel] * 2))
         u, v = np.moveaxis(np.stack([axes_across(n) for n in normals]), 1, 0)
         grid = a[:, None] * u[:, None] + b[:, None] * v[:, None]
+        points, normals = (np.ascontiguousarray(x, dtype=float) for x in (points, normals))
         return cls(part, points, normals, pixel, grid, np.stack([np.ones_like(a), a, b], 1))
 
 
@@ -157,16 +155,47 @@ def patches_of(
 
 def shown(patches: Patches, T: np.ndarray, photograph: Photograph, tolerance: float) -> np.ndarray:
     """(n,) bool: patches, moved by T, that face a photograph and lie on what the model draws there, up to corners."""
-    side = math.isqrt(patches.grid.shape[1])
-    cells = [0, side - 1, side * side // 2, -side, -1]
-    points, normals = moved(patches.points, T), patches.normals @ T[:3, :3].T
-    towards = photograph.camera.centre - points
-    facing = (normals * towards).sum(1) > LEAST_FACING * np.linalg.norm(towards, axis=1)
-    places = moved((patches.points[:, None] + patches.grid[:, cells]).reshape(-1, 3), T)
-    at, depth = photograph.camera.project(places)
-    drawn, part = photograph.there(at.reshape(-1, len(cells), 2))
-    on_it = (part == patches.part) & (np.abs(drawn - depth.reshape(drawn.shape)) < tolerance)
-    return facing & on_it.all(1)
+    answer = np.empty(len(patches.points), bool)
+    parallel(
+        _shown,
+        torch.get_num_threads(),
+        *(patches.points, patches.normals, patches.grid),
+        *(photograph.camera.T_camera_world[:3] @ T, photograph.intrinsics),
+        *(photograph.depth, photograph.part, patches.part, tolerance, answer),
+    )
+    return answer
+
+
+@njit(**KERNEL)
+def _shown(
+    points, normals, grid, T_camera_part, intrinsics, depth, part, wanted, tolerance, answer, thread, threads
+):  # pragma: no cover - compiled
+    T, (fx, fy, cx, cy), (height, width), count = T_camera_part, intrinsics, depth.shape, grid.shape[1]
+    side = int(np.sqrt(np.float64(count)) + 0.5)
+    for i in range(thread, points.shape[0], threads):
+        x, y, z = _through(T, points[i, 0], points[i, 1], points[i, 2])
+        facing = 0.0
+        for a, towards in enumerate((x, y, z)):
+            turned = T[a, 0] * normals[i, 0] + T[a, 1] * normals[i, 1] + T[a, 2] * normals[i, 2]
+            facing -= turned * towards
+        answer[i] = facing > LEAST_FACING * np.sqrt(x * x + y * y + z * z)
+        for cell in (0, side - 1, count // 2, count - side, count - 1):
+            if answer[i]:
+                at = points[i, 0] + grid[i, cell, 0], points[i, 1] + grid[i, cell, 1], points[i, 2] + grid[i, cell, 2]
+                x, y, z = _through(T, *at)
+                u, v = int(np.floor(fx * x / z + cx)), int(np.floor(fy * y / z + cy))
+                inside = z > 0 and u >= 2 and v >= 2 and u < width - 2 and v < height - 2
+                answer[i] = inside and part[v, u] == wanted and abs(depth[v, u] - z) < tolerance
+
+
+@njit(**INLINE)
+def _through(T, x, y, z):  # pragma: no cover - compiled
+    """A point under the transform (3, 4)."""
+    return (
+        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
+        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
+        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
+    )
 
 
 def adjust(
@@ -257,34 +286,80 @@ def looks(
     jacobian = np.zeros((*texture.shape, local.shape[1] + slopes.shape[1]), np.float32)
     moves = np.zeros(len(order), bool)
     for (state, photo, rows), slot in zip(pairs, np.split(np.argsort(order), ends[:-1]), strict=False):
-        texture[slot], jacobian[slot] = _seen(patches, rows, local[rows], photo, at[state], slopes[state])
+        parallel(
+            _seen,
+            torch.get_num_threads(),
+            *(patches.points, patches.normals, patches.grid, patches.slant, local, rows, slot),
+            *(photo.camera.T_camera_world[:3] @ at[state], photo.camera.T_camera_world[:3, :3] @ slopes[state, :, :3]),
+            *(photo.intrinsics, photo.spline, photo.slope, texture, jacobian),
+        )
         moves[slot] = state > 0
     return patch[order], moves, texture, jacobian
 
 
+@njit(**KERNEL)
 def _seen(
-    patches: Patches, rows: np.ndarray, local: np.ndarray, photo: Photograph, T: np.ndarray, slopes: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Grey values (n, cells) of patches in a photograph, and how they change with local and joint numbers.
+    points, normals, grid, slant, local, rows, slot, T_camera_part, slopes, intrinsics, spline, slope, texture,
+    jacobian, thread, threads,
+):  # fmt: skip  # pragma: no cover - compiled
+    """Grey values of the patches ``rows`` in a photograph, and how they change with local and joint numbers.
 
-    ``local`` (n, 3) are offset and tilts; ``slopes`` (p, 4, 4) is how T changes with the numbers of the joint.
+    Both go to the rows ``slot`` of ``texture`` and ``jacobian``; ``slopes`` (p, 3, 4) is how T_camera_part does.
     """
-    camera, R = photo.camera, photo.camera.T_camera_world[:3, :3]
-    normal = patches.normals[rows]
-    points = patches.points[rows, None] + patches.grid[rows] + (local @ patches.slant.T)[..., None] * normal[:, None]
-    flat = points.reshape(-1, 3)
-    place = moved(flat, T)
-    at, depth = camera.project(place)
-    inverse = 1 / depth[:, None]
-    along = photo.slopes(at) * [camera.fx, camera.fy] * inverse
-    x, y = ((place - camera.centre) @ R.T)[:, :2].T
-    deeper = -(along[:, :1] * x[:, None] + along[:, 1:] * y[:, None]) * inverse
-    gradient = np.concatenate([along, deeper], 1) @ R
-    by_normal = (gradient.reshape(points.shape) * (normal @ T[:3, :3].T)[:, None]).sum(-1)
-    by_joint = np.array([(gradient * (flat @ D[:3, :3].T + D[:3, 3])).sum(1) for D in slopes]).T
-    by_local = by_normal[..., None] * patches.slant
-    jacobian = np.concatenate([by_local, by_joint.reshape(*by_local.shape[:2], -1)], 2)
-    return photo.intensities(at).reshape(by_local.shape[:2]), jacobian
+    T, (fx, fy, cx, cy), (height, width) = T_camera_part, intrinsics, spline.shape
+    across, down = np.empty(4, np.float32), np.empty(4, np.float32)
+    for k in range(thread, rows.shape[0], threads):
+        i, row = rows[k], slot[k]
+        normal = normals[i]
+        turned = np.empty(3)
+        for a in range(3):
+            turned[a] = T[a, 0] * normal[0] + T[a, 1] * normal[1] + T[a, 2] * normal[2]
+        for c in range(grid.shape[1]):
+            off = local[i, 0] * slant[c, 0] + local[i, 1] * slant[c, 1] + local[i, 2] * slant[c, 2]
+            px, py, pz = (
+                points[i, 0] + grid[i, c, 0] + off * normal[0],
+                points[i, 1] + grid[i, c, 1] + off * normal[1],
+                points[i, 2] + grid[i, c, 2] + off * normal[2],
+            )
+            x, y, z = _through(T, px, py, pz)
+            # Pixel (0, 0) has its centre at 0.5, the coefficients theirs at 0; at an edge the last one goes on.
+            u = min(max(fx * x / z + cx - 0.5, 1.0), width - 2.001)
+            v = min(max(fy * y / z + cy - 0.5, 1.0), height - 2.001)
+            left, top = int(u), int(v)
+            s, t = np.float32(u - left), np.float32(v - top)
+            _cubic(s, across)
+            _cubic(t, down)
+            value = np.float32(0)
+            for b in range(4):
+                for a in range(4):
+                    value += down[b] * across[a] * spline[top + b - 1, left + a - 1]
+            texture[row, c] = value
+            gx, gy = _between(slope[0], left, top, s, t) * fx / z, _between(slope[1], left, top, s, t) * fy / z
+            gz = -(gx * x + gy * y) / z
+            by_normal = gx * turned[0] + gy * turned[1] + gz * turned[2]
+            for a in range(3):
+                jacobian[row, c, a] = by_normal * slant[c, a]
+            for j in range(slopes.shape[0]):
+                dx, dy, dz = _through(slopes[j], px, py, pz)
+                jacobian[row, c, 3 + j] = gx * dx + gy * dy + gz * dz
+
+
+@njit(**INLINE)
+def _cubic(t, weights):  # pragma: no cover - compiled
+    """Weights of the cubic B-spline's four coefficients around a place, ``t`` behind the second."""
+    sixth, s = np.float32(1 / 6), np.float32(1) - t
+    weights[0] = s * s * s * sixth
+    weights[1] = np.float32(2 / 3) - t * t * (np.float32(2) - t) * np.float32(0.5)
+    weights[2] = np.float32(2 / 3) - s * s * (np.float32(2) - s) * np.float32(0.5)
+    weights[3] = t * t * t * sixth
+
+
+@njit(**INLINE)
+def _between(image, left, top, s, t):  # pragma: no cover - compiled
+    """The image, bilinear, ``s`` and ``t`` behind a pixel."""
+    upper = image[top, left] + s * (image[top, left + 1] - image[top, left])
+    lower = image[top + 1, left] + s * (image[top + 1, left + 1] - image[top + 1, left])
+    return upper + t * (lower - upper)
 
 
 def _residuals(

@@ -15,13 +15,17 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from hingesplat.camera import Camera
 from hingesplat.capture import View
+from hingesplat.capture.images import downsampled
 from hingesplat.gaussians import Gaussians
 from hingesplat.render import render
+from hingesplat.simd import KERNEL
 from hingesplat.stereo import DepthMap, seen_through, witnesses
 from hingesplat.threads import parallel
 
 FREE, SURFACE, HIDDEN, COLOUR = range(4)
 """Columns of ``ask``'s answer."""
+BLOCK = 512
+"""Points that are asked about at once."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,11 @@ class Sight:
         off = np.asarray(minimum_filter(self.depth == 0, (1, 3, 3)), bool)
         return np.stack([np.where((far > 0) | off, near, 0), np.where(off, np.inf, far)], -1).astype(np.float32)
 
+    @cached_property
+    def pixels(self) -> np.ndarray:
+        """(v, h, w, 4) float32: colour and depth side by side."""
+        return np.concatenate([self.rgb, self.depth[..., None]], -1)
+
 
 @torch.no_grad()
 def look(
@@ -60,32 +69,20 @@ def look(
     pixels where the maps see through what is rendered: fits put lids on hollows. The mask comes from the photograph,
     so that a floater makes no surface where the photograph shows background.
     """
-    longest = max(max(v.camera.width, v.camera.height) for v in views)
-    factor = max(longest / size, 1.0)
-    width = max(round(v.camera.width / factor) for v in views)
-    height = max(round(v.camera.height / factor) for v in views)
-    P, depth, rgb = [], [], []
-    for i, view in enumerate(views):
-        camera = view.camera.scaled(round(view.camera.width / factor), round(view.camera.height / factor))
-        r = render(gaussians, camera)
-        rgba = torch.from_numpy(view.rgba).permute(2, 0, 1)[None].float() / 255
-        small = torch.nn.functional.interpolate(rgba, (camera.height, camera.width), mode="area")[0]
-        mask = small[3] > 0.5
-        solid = r.alpha > 0.3
-        d = torch.where(mask & solid, r.depth / r.alpha.clamp_min(1e-3), torch.where(mask, -1.0, 0.0))
-        if maps:
-            d = torch.from_numpy(_corrected(d.numpy(), camera, maps[i], maps, 2 * tolerance))
-        picture = small[:3] * small[3:] + 1 - small[3:]
-        pad = (0, width - camera.width, 0, height - camera.height)
-        depth.append(torch.nn.functional.pad(d, pad).numpy())
-        rgb.append(torch.nn.functional.pad(picture, pad, value=1.0).permute(1, 2, 0).numpy())
-        P.append(camera.K @ camera.T_camera_world[:3])
-    return Sight(
-        np.stack(P).astype(np.float32),
-        np.ascontiguousarray(np.stack(depth), dtype=np.float32),
-        np.ascontiguousarray(np.stack(rgb), dtype=np.float32),
-        tolerance,
-    )
+    factor = max(max(max(v.camera.width, v.camera.height) for v in views) / size, 1.0)
+    photographs = [downsampled(v, round(max(v.camera.width, v.camera.height) / factor)) for v in views]
+    shape = len(views), max(v.camera.height for v in photographs), max(v.camera.width for v in photographs)
+    depth, rgb = np.zeros(shape, np.float32), np.ones((*shape, 3), np.float32)
+    for i, view in enumerate(photographs):
+        r, rgba = render(gaussians, view.camera), torch.from_numpy(view.rgba).float() / 255
+        mask = rgba[..., 3] > 0.5
+        drawn = torch.where(mask & (r.alpha > 0.3), r.depth / r.alpha.clamp_min(1e-3), torch.where(mask, -1.0, 0.0))
+        known = _corrected(drawn.numpy(), view.camera, maps[i], maps, 2 * tolerance) if maps else drawn.numpy()
+        rows, columns = slice(view.camera.height), slice(view.camera.width)
+        depth[i, rows, columns] = known
+        rgb[i, rows, columns] = rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
+    P = np.stack([v.camera.K @ v.camera.T_camera_world[:3] for v in photographs])
+    return Sight(P.astype(np.float32), depth, rgb, tolerance)
 
 
 def _corrected(
@@ -104,54 +101,64 @@ def _corrected(
     return depth
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _ask(points, colours, P, depth, reach, rgb, tolerance, answer, thread, threads):  # pragma: no cover - compiled
-    views, height, width = depth.shape
-    answer[thread::threads] = 0
-    # One picture after the other, so that it stays in the cache.
+@njit(**KERNEL)
+def _ask(points, colours, P, reach, pixels, tolerance, answer, thread, threads):  # pragma: no cover - compiled
+    views, height, width = reach.shape[:3]
+    first, last = points.shape[1] * thread // threads, points.shape[1] * (thread + 1) // threads
+    answer[:, first:last] = 0
+    zero, one = np.float32(0), np.float32(1)
+    depth, pixel, left = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
+    # One picture after the other, so that it stays in the cache; a few points at once, without a branch.
     for v in range(views):
-        p = P[v]
-        for i in range(thread, points.shape[0], threads):
-            x, y, z = points[i, 0], points[i, 1], points[i, 2]
-            d = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
-            if d < 1e-3:
-                continue
-            u = int(np.floor((p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]) / d))
-            w = int(np.floor((p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]) / d))
-            if u < 1 or w < 1 or u >= width - 1 or w >= height - 1:
-                continue
+        p, bounds, picture = P[v], reach[v].reshape(-1, 2), pixels[v].reshape(-1, 4)
+        for start in range(first, last, BLOCK):
+            n = min(BLOCK, last - start)
+            x, y, z = points[0, start : start + n], points[1, start : start + n], points[2, start : start + n]
+            free, surface, hidden = (
+                answer[FREE, start : start + n],
+                answer[SURFACE, start : start + n],
+                answer[HIDDEN, start : start + n],
+            )
+            for i in range(n):
+                depth[i] = p[2, 0] * x[i] + p[2, 1] * y[i] + p[2, 2] * z[i] + p[2, 3]
+                u = (p[0, 0] * x[i] + p[0, 1] * y[i] + p[0, 2] * z[i] + p[0, 3]) / depth[i]
+                w = (p[1, 0] * x[i] + p[1, 1] * y[i] + p[1, 2] * z[i] + p[1, 3]) / depth[i]
+                within = (u >= 1) & (w >= 1) & (u < np.float32(width - 1)) & (w < np.float32(height - 1))
+                within &= depth[i] >= np.float32(1e-3)
+                pixel[i] = np.int32(w if within else zero) * np.int32(width) + np.int32(u if within else zero)
+            count = 0
+            for i in range(n):
+                near, far, within = bounds[pixel[i], 0], bounds[pixel[i], 1], pixel[i] > 0
+                before = within & (depth[i] <= near - tolerance)
+                behind = within & (depth[i] >= far + tolerance) & (not before)
+                free[i] += one if before else zero
+                hidden[i] += one if behind & (far > 0) else zero  # 0: nothing is known.
+                left[count] = i
+                count += within & (not before) & (not behind)
             # The best of nine pixels decides, so that an edge or a speckle one pixel off is no contradiction.
-            near, far = reach[v, w, u, 0], reach[v, w, u, 1]
-            if d <= near - tolerance:
-                answer[i, FREE] += 1
-                continue
-            if d >= far + tolerance:
-                answer[i, HIDDEN] += far > 0  # 0: nothing is known.
-                continue
-            least = np.float32(1e9)
-            signed = np.float32(0)
-            for b in range(-1, 2):
-                for a in range(-1, 2):
-                    s = depth[v, w + b, u + a]
-                    if s > 0 and abs(d - s) < least:
-                        least = abs(d - s)
-                        signed = d - s
-            if least < tolerance:
-                answer[i, SURFACE] += 1
-                closest, c = np.float32(3), i % colours.shape[0]
+            for i in left[:count]:
+                least, signed = np.float32(1e9), zero
                 for b in range(-1, 2):
                     for a in range(-1, 2):
-                        e0 = rgb[v, w + b, u + a, 0] - colours[c, 0]
-                        e1 = rgb[v, w + b, u + a, 1] - colours[c, 1]
-                        e2 = rgb[v, w + b, u + a, 2] - colours[c, 2]
-                        closest = min(closest, e0 * e0 + e1 * e1 + e2 * e2)
-                answer[i, COLOUR] += np.sqrt(closest)
-            elif signed < 0:
-                answer[i, FREE] += 1
-            else:
-                answer[i, HIDDEN] += 1
-    for i in range(thread, points.shape[0], threads):
-        answer[i, COLOUR] /= max(answer[i, SURFACE], np.float32(1))
+                        shown = picture[pixel[i] + b * width + a, 3]
+                        off = depth[i] - shown
+                        nearer = (shown > 0) & (abs(off) < least)
+                        least, signed = abs(off) if nearer else least, off if nearer else signed
+                if least < tolerance:
+                    surface[i] += 1
+                    closest, c = np.float32(3), (start + i) % colours.shape[0]
+                    for b in range(-1, 2):
+                        for a in range(-1, 2):
+                            there = picture[pixel[i] + b * width + a]
+                            e0, e1, e2 = there[0] - colours[c, 0], there[1] - colours[c, 1], there[2] - colours[c, 2]
+                            closest = min(closest, e0 * e0 + e1 * e1 + e2 * e2)
+                    answer[COLOUR, start + i] += np.sqrt(closest)
+                elif signed < 0:
+                    free[i] += 1
+                else:
+                    hidden[i] += 1
+    for i in range(first, last):
+        answer[COLOUR, i] /= max(answer[SURFACE, i], one)
 
 
 def ask(points: np.ndarray, colours: np.ndarray, sight: Sight) -> np.ndarray:
@@ -161,17 +168,16 @@ def ask(points: np.ndarray, colours: np.ndarray, sight: Sight) -> np.ndarray:
         (n, 4): the number of views in which the point is in free space, on the surface, hidden behind it; and the mean
         Euclidean RGB difference (best of nine pixels) over the views that see it on the surface.
     """
-    answer = np.empty((len(points), 4), np.float32)
+    answer = np.empty((4, len(points)), np.float32)
     parallel(
         _ask,
         torch.get_num_threads(),
-        np.ascontiguousarray(points, dtype=np.float32),
+        np.ascontiguousarray(points.T, dtype=np.float32),
         np.ascontiguousarray(colours, dtype=np.float32),
         sight.P,
-        sight.depth,
         sight.reach,
-        sight.rgb,
+        sight.pixels,
         np.float32(sight.tolerance),
         answer,
     )
-    return answer
+    return answer.T

@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from trimesh.exchange.obj import export_obj
 
 from hingesplat.errors import HingesplatError
 from hingesplat.export import ExportConfig
-from hingesplat.export.obj import write_obj
+from hingesplat.export.obj import obj_files
 from hingesplat.export.solids import closed_mesh, collision_hulls, free_range, near
 from hingesplat.files import write_text
 from hingesplat.twin import Joint, Part, Twin
@@ -61,6 +62,11 @@ class Link:
     def moments(self) -> dict[str, float]:
         """``inertia`` under the names that URDF and SDF share."""
         return {f"i{'xyz'[r]}{'xyz'[c]}": self.inertia[r, c] for r, c in zip(*np.triu_indices(3), strict=True)}
+
+    @cached_property
+    def visual_files(self) -> dict[str, bytes]:
+        """What shows its mesh, by file name: the same in all formats."""
+        return {} if self.mesh is None else obj_files(self.mesh, self.name)
 
     @property
     def moves(self) -> bool:
@@ -151,10 +157,11 @@ def write_meshes(links: list[Link], out: Path) -> None:
         for what, _, file, mesh in shapes(link):
             path = out / file
             path.parent.mkdir(parents=True, exist_ok=True)
-            if what == "visual":
-                write_obj(mesh, path)
-            else:
+            if what == "collision":
                 write_text(path, export_obj(mesh))
+                continue
+            for name, content in link.visual_files.items():
+                (path.parent / name).write_bytes(content)
 
 
 def touching(links: list[Link]) -> list[tuple[Link, Link]]:

@@ -1,22 +1,22 @@
 """OBJ files that show their colours everywhere: a vertex each, and baked into a texture."""
 
-from pathlib import Path
+from io import BytesIO
 
 import numpy as np
 import trimesh
 from PIL import Image
 
 from hingesplat.export.solids import colours
-from hingesplat.files import write_text
 
 
-def write_obj(mesh: trimesh.Trimesh, path: Path) -> None:
-    """Write a coloured mesh with ``NAME.png`` and ``NAME.mtl`` beside it, the texture that ``bake`` makes."""
+def obj_files(mesh: trimesh.Trimesh, name: str) -> dict[str, bytes]:
+    """A coloured mesh as ``name.obj`` with the files that belong beside it, the texture being what ``bake`` makes."""
     rgb = colours(mesh)
     picture, uv = bake(mesh)
-    Image.fromarray(picture).save(path.with_suffix(".png"))
-    write_text(path.with_suffix(".mtl"), f"newmtl {path.stem}\nKd 1 1 1\nKs 0 0 0\nmap_Kd {path.stem}.png\n")
-    lines = [f"mtllib {path.stem}.mtl", f"usemtl {path.stem}"]
+    png = BytesIO()
+    Image.fromarray(picture).save(png, "PNG")
+    material = f"newmtl {name}\nKd 1 1 1\nKs 0 0 0\nmap_Kd {name}.png\n"
+    lines = [f"mtllib {name}.mtl", f"usemtl {name}"]
     lines += [
         f"v {x:.7g} {y:.7g} {z:.7g} {r:.4g} {g:.4g} {b:.4g}"
         for (x, y, z), (r, g, b) in zip(
@@ -27,7 +27,8 @@ def write_obj(mesh: trimesh.Trimesh, path: Path) -> None:
     lines += [
         f"f {a}/{3 * i + 1} {b}/{3 * i + 2} {c}/{3 * i + 3}" for i, (a, b, c) in enumerate((mesh.faces + 1).tolist())
     ]
-    write_text(path, "\n".join(lines) + "\n")
+    text = "\n".join(lines) + "\n"
+    return {f"{name}.png": png.getvalue(), f"{name}.mtl": material.encode(), f"{name}.obj": text.encode()}
 
 
 def bake(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
