@@ -20,6 +20,7 @@ from hingesplat.search import (
     score_volume,
 )
 from hingesplat.surface import Surface, bounds, surface_of
+from hingesplat.visibility import ask
 from scenes import (
     ANGLE,
     AXIS,
@@ -40,7 +41,8 @@ def prepared(kind: str) -> tuple[Surface, Surface, ScoreVolume, np.ndarray]:
     made = scene("revolute" if kind == "revolute" else "prismatic", 96, 0.04)
     low, high = bounds([made.at(s).means.numpy() for s in (0, 1)])
     a, b = (surface_of(made.at(s), made.views[s], (), 96, 0.02, 0.02) for s in (0, 1))
-    volume = score_volume(b.points, b.colours, b.sight, a.sight, low, high, CELLS)
+    novel = novelty(ask(b.points, b.colours, a.sight))
+    volume = score_volume(b.points, b.colours, novel, b.sight, low, high, CELLS)
     return a, b, volume, made.gaussians.part.numpy()[nearest(a.points, made.gaussians)] == 1
 
 

@@ -15,7 +15,7 @@ from hingesplat.mechanism import oddity
 from hingesplat.register import register
 from hingesplat.screw import axes_across, matrix_to_screw
 from hingesplat.se3 import apart, moved
-from hingesplat.search import BASE, Motion, ScoreVolume, inverted, scan, there_and_back
+from hingesplat.search import BASE, OLD, Motion, ScoreVolume, inverted, scan, score_volume, there_and_back
 from hingesplat.stereo import Cloud
 from hingesplat.surface import Surface, components
 from hingesplat.visibility import Sight
@@ -64,6 +64,8 @@ class HypothesesConfig:
     """Seeds moved in one search."""
     agreeing_cost: float = 0.45
     """A seed agrees with a motion that costs it less than this."""
+    explained_cost: float = 0.8
+    """A seed that a motion explains worse than this counts as unexplained."""
     starts: int = 60
     """Hypotheses that climb, beside the best of every group of seeds."""
     leaders: int = 3
@@ -83,12 +85,41 @@ class Evidence:
     """What every search for motions between two states goes by; pairs are (state 0, the other)."""
 
     surfaces: tuple[Surface, Surface]
-    fresh: tuple[Surface, Surface]
-    """The points of each state that the other does not show in the same place: there something may have come to lie."""
-    volumes: tuple[ScoreVolume, ScoreVolume]
-    extent: float
+    novel: tuple[np.ndarray, np.ndarray]
+    """(n,) ``novelty`` of each of their points."""
+    low: np.ndarray
+    high: np.ndarray
+    """(3,) corners of both states together."""
+    cells: int
+    """Voxels along the longest side, in the search."""
     config: HypothesesConfig
     rng: np.random.Generator
+
+    @cached_property
+    def extent(self) -> float:
+        """The longest side."""
+        return float((self.high - self.low).max())
+
+    @cached_property
+    def fresh(self) -> tuple[Surface, Surface]:
+        """The points of each state that the other does not show in the same place: something may have come to lie."""
+        first, second = (s.rows(np.flatnonzero(n > 0.5)) for s, n in zip(self.surfaces, self.novel, strict=True))
+        return first, second
+
+    @cached_property
+    def volumes(self) -> tuple[ScoreVolume, ScoreVolume]:
+        """Of each state, where what comes from the other would be welcome."""
+        box = self.low, self.high, self.cells
+        each = zip(self.surfaces, self.novel, strict=True)
+        first, second = (score_volume(s.points, s.colours, n, s.sight, *box) for s, n in each)
+        return first, second
+
+    def left_by(self, motions: Sequence[Motion]) -> "Evidence":
+        """The same where nothing is new that one of the motions explains: two parts are never in one place."""
+        costs = both_ways(seed_costs, self.surfaces, motions, self.extent).min(1)
+        explained = np.split(costs < self.config.explained_cost, [len(self.novel[0])])
+        first, second = (np.where(e, np.minimum(n, OLD), n) for e, n in zip(explained, self.novel, strict=True))
+        return replace(self, novel=(first, second))
 
     def seen(self, seeds: Sequence[np.ndarray]) -> tuple[Surface, Surface]:
         """Of each state, the points in these rows."""
@@ -287,8 +318,10 @@ _costs_anywhere = partial(seed_costs, far_cost=0.0)
 def propose_hanging(evidence: Evidence, seeds: Sequence[np.ndarray], carriers: Sequence[Motion]) -> list[Motion]:
     """Hypotheses for seeds that no joint on the base explains: joints on the parts that the carriers move.
 
-    Only motions that no joint on the base comes near.
+    Only motions that no joint on the base comes near. A latch fits anywhere on the door that carries it, so what the
+    carriers explain is not new.
     """
+    evidence = evidence.left_by(carriers)
     config, least = evidence.config, HANGING * evidence.extent
     if sum(map(len, seeds)) < config.min_points:
         return []

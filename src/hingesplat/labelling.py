@@ -36,8 +36,6 @@ NOBODY = 0.3
 agrees (1)."""
 UNMET = 0.5
 """What a point counts that a promising motion takes where the other state shows none."""
-NEARLY = 0.3
-"""Cost of a point by which one explanation is no more than a little worse than another."""
 AT_ONCE = 400_000
 """Places that photographs are asked about in one go."""
 ADDED, EXCHANGED, PAIRED, SECOND = 10, 6, 8, 2
@@ -221,17 +219,6 @@ class Labelling:
     def labels(self, T_1_0: Sequence[np.ndarray]) -> Labels:
         """Labels of both states' points under these motions, all of which stay."""
         return self.mean_field(self.costs(T_1_0), self.partners(T_1_0))[0]
-
-    def alone(self, T_1_0: Sequence[np.ndarray]) -> np.ndarray:
-        """(motions,) share of each motion's points that neither another of them nor to stay explains nearly as well."""
-        costs = self.costs(T_1_0)
-        labels = self.mean_field(costs, self.partners(T_1_0))[0]
-        result = np.zeros(len(T_1_0))
-        for k in range(len(T_1_0)):
-            own = np.concatenate([c[label == k + 1] for c, label in zip(costs, labels, strict=True)])
-            worse = np.delete(own, k + 1, 1).min(1) - own[:, k + 1]
-            result[k] = (worse > NEARLY).mean() if len(own) else 0
-        return result
 
 
 def meeting(partners: Sequence[np.ndarray], owned: Labels) -> np.ndarray:

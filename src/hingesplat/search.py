@@ -28,6 +28,9 @@ CLOSER_LOOK = 0.6
 BASE = np.eye(4)
 """Where the base takes what hangs on it."""
 
+OLD = 0.15
+"""Score of a surface that was there before, or came from somewhere else."""
+
 HIDDEN_SCORE = 0.3
 """Score of unseen space, between a surface that fits (1) and free space (−1)."""
 
@@ -63,17 +66,16 @@ class ScoreVolume:
 def score_volume(
     points: np.ndarray,
     colours: np.ndarray,
+    novel: np.ndarray,
     here: Sight,
-    other: Sight,
     low: np.ndarray,
     high: np.ndarray,
     cells: int,
 ) -> ScoreVolume:
     """Score volume of the state seen by ``here``, whose surface is sampled by points (n, 3) with colours (n, 3).
 
-    A surface voxel is worth 1 where the other state saw free space, 0.6 where the other state could not see,
-    and 0.15 where it saw a surface, too. Space that nobody sees is worth a little, since parts do go there (the sides
-    of a drawer); free space costs −1.
+    A surface voxel is worth as much as it is ``novel`` (n,). Space that nobody sees is worth a little, since parts do
+    go there (the sides of a drawer); free space costs −1.
     """
     voxel = float((high - low).max()) / cells
     shape = np.ceil((high - low) / voxel).astype(int) + 1
@@ -81,9 +83,8 @@ def score_volume(
     centres = centres * voxel + low
     views_free = ask(centres, np.zeros_like(centres), here)[:, FREE].reshape(shape)
     index = np.clip(np.round((points - low) / voxel).astype(int), 0, shape - 1)
-    novelty_of_point = novelty(ask(points, colours, other))
     occupied = np.zeros(shape, np.float32)
-    np.maximum.at(occupied, tuple(index.T), novelty_of_point)
+    np.maximum.at(occupied, tuple(index.T), novel)
     colour = np.zeros((*shape, 3), np.float32)
     count = np.zeros(shape, np.float32)
     np.add.at(colour, tuple(index.T), colours)
@@ -98,10 +99,13 @@ def score_volume(
 
 
 def novelty(answer: np.ndarray) -> np.ndarray:
-    """(n,) how new a surface point is, from what the other state's cameras say of it."""
+    """(n,) how new a surface point is, from what the other state's cameras say of it.
+
+    It is 1 where the other state saw free space, 0.6 where it could not see, and ``OLD`` where it saw a surface, too.
+    """
     new = answer[:, FREE] >= 3
     seen = answer[:, SURFACE] >= 2
-    return np.where(new, 1.0, np.where(seen, 0.15, 0.6)).astype(np.float32)
+    return np.where(new, 1.0, np.where(seen, OLD, 0.6)).astype(np.float32)
 
 
 HIDDEN32 = np.float32(HIDDEN_SCORE)

@@ -40,7 +40,7 @@ from hingesplat.pieces import (
     split_pieces,
 )
 from hingesplat.se3 import apart
-from hingesplat.search import BASE, Motion, carrier_of, inverted, novelty, score_volume
+from hingesplat.search import BASE, Motion, carrier_of, inverted, novelty
 from hingesplat.stereo import DepthMap
 from hingesplat.surface import Labels, Pair, Surface, bounds, surface_of, thin
 from hingesplat.texture import (
@@ -59,9 +59,6 @@ from hingesplat.texture import (
 from hingesplat.training import evenly
 from hingesplat.visibility import FREE, HIDDEN, ask
 
-ALONE = 0.8
-"""Share of a hanging part's points that nothing else may explain nearly as well; else they are those of a door whose
-motion is a little off."""
 ALIKE = 0.06
 """Extents between the places to which two motions take points, in the mean, for them to be nearly the same."""
 HEARD = (0.1, 0.3, 0.3)
@@ -76,8 +73,9 @@ RIVALS = 6
 """Motions that are heard in place of each of the best, and of each two of them."""
 STAYS = 0.8
 """Share of its price for which a motion stays that was chosen among all: what is worth just that would come and go."""
-MEETING = 0.5
-"""Share of a part's points that must meet its points of the other state, in one of the states."""
+MEETING, HANGING_MEETS = 0.5, 0.8
+"""Share of a part's points that must meet its points of the other state, in one of the states; of one that hangs on
+another there is little else to go by: right ones had 0.90 and more, wrong ones 0.75 and less."""
 PASSED_ON, RIDING = 0.5, 0.6
 """Share of a part's points that lie on one part in state 0 and on another in state 1, or on the same in both, from
 which it is none."""
@@ -99,8 +97,6 @@ class SegmentConfig:
     """Voxels along the object's longest side in the search."""
     max_seeds: int = 1200
     """Seeds of each state that judge the hypotheses."""
-    explained_cost: float = 0.8
-    """A seed that a motion explains worse than this counts as unexplained."""
     part_cost: float = 50.0
     """Description length of one more part, in points (a point stands for 0.03² of the extent's square)."""
     hanging_cost: float = 22.0
@@ -175,16 +171,9 @@ def gather(
 
     ``low`` and ``high`` (3,) are the corners of both states together.
     """
-    extent = float((high - low).max())
-    sights = [surface.sight for surface in surfaces]
-    seeds, answers = must_have_moved(surfaces, extent, rng)
-    # Where both states show a surface, nothing that moved has come to lie.
-    fresh = [s.rows(np.flatnonzero(novelty(a) > 0.5)) for s, a in zip(surfaces, answers, strict=True)]
-    volumes = [
-        score_volume(surfaces[s].points, surfaces[s].colours, sights[s], sights[1 - s], low, high, config.cells)
-        for s in (0, 1)
-    ]
-    return Evidence(surfaces, (fresh[0], fresh[1]), (volumes[0], volumes[1]), extent, config.hypotheses, rng), seeds
+    seeds, answers = must_have_moved(surfaces, float((high - low).max()), rng)
+    first, second = map(novelty, answers)
+    return Evidence(surfaces, (first, second), low, high, config.cells, config.hypotheses, rng), seeds
 
 
 def segment(
@@ -223,7 +212,7 @@ def segment(
         chosen = case.heard_again(chosen, found, photographs, seed)
     chosen, owned = _labelled(chosen, surfaces, evidence.extent, config, parts)
     costs = _seed_costs(evidence, judges, chosen) if chosen else np.ones((1, 1))
-    unexplained = float((costs.min(1) >= config.explained_cost).mean())
+    unexplained = float((costs.min(1) >= config.hypotheses.explained_cost).mean())
     labels = tuple(spread_labels(gaussians[s].means.numpy(), surfaces[s], owned[s]) for s in (0, 1))
     return Segmentation((labels[0], labels[1]), tuple(chosen), unexplained, n_seeds)
 
@@ -382,21 +371,18 @@ class _Case:
         """The motions, with those of parts that hang on theirs if what no joint on the base explains says so."""
         if not chosen:
             return chosen
-        left = _seed_costs(self.evidence, self.seeds, chosen).min(1) >= self.config.explained_cost
+        left = _seed_costs(self.evidence, self.seeds, chosen).min(1) >= self.config.hypotheses.explained_cost
         first, second = np.split(left, [len(self.seeds[0])])
         stray = (self.seeds[0][first], self.seeds[1][second])
         hanging = propose_hanging(self.evidence, stray, chosen)
         if not hanging:
             return chosen
         more = self.settled([*chosen, *hanging], [self.config.hanging_cost] * (len(chosen) + len(hanging)))
-        # One after the other, since two that are alike are not alone, either of them.
-        while hang := [k for k, m in enumerate(more) if carrier_of(m, more) is not None]:
-            alone = self.problem.alone([motion.T for motion in more])
-            least = min(hang, key=lambda k: float(alone[k]))
-            if alone[least] > ALONE:
-                return more
-            more = more[:least] + more[least + 1 :]
-        return chosen
+        ways = [m.T for m in more]
+        partners = self.problem.partners(ways)
+        share = meeting(partners, self.problem.mean_field(self.problem.costs(ways), partners)[0])
+        kept = [m for m, s in zip(more, share, strict=True) if s > HANGING_MEETS or carrier_of(m, more) is None]
+        return kept if any(carrier_of(m, kept) is not None for m in kept) else chosen
 
     def without_still(
         self, chosen: list[Motion], photographs: Sequence[Sequence[Photograph]], seed: int

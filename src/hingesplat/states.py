@@ -11,9 +11,10 @@ from hingesplat.capture import View
 from hingesplat.gaussians import Gaussians
 from hingesplat.hypotheses import polished
 from hingesplat.se3 import moved
-from hingesplat.search import BASE, Motion, carrier_of, scan, score_volume
+from hingesplat.search import BASE, Motion, carrier_of, novelty, scan, score_volume
 from hingesplat.segment import Segmentation, SegmentConfig, must_have_moved, segment, survey
 from hingesplat.stereo import DepthMap
+from hingesplat.visibility import ask
 
 
 def segment_states(
@@ -139,7 +140,8 @@ def track(
     rng = np.random.default_rng(seed)
     low, high, (here, there) = survey(gaussians, views, maps, config)
     extent = float((high - low).max())
-    volume = score_volume(there.points, there.colours, there.sight, here.sight, low, high, 2 * config.cells)
+    novel = novelty(ask(there.points, there.colours, here.sight))
+    volume = score_volume(there.points, there.colours, novel, there.sight, low, high, 2 * config.cells)
     own_label = labels[KDTree(gaussians[0].means.numpy()).query(here.points)[1]]
     carriers = [carrier_of(motion, motions) for motion in motions]
     found: dict[int, np.ndarray] = {}
