@@ -613,6 +613,17 @@ def test_texture_is_asked_about_what_is_chosen_and_may_have_it_replaced(turned: 
     assert told_apart(Choices(Labelling.of(surfaces, extent), [TURN.T]), against({0: 1e6}), 20, None) == {0: 60}
 
 
+def test_an_odd_joint_is_in_doubt_before_texture_says_anything(turned: Turned) -> None:
+    """Of two odd ones that explain the same the other is heard, too, where a joint could be had that is not odd."""
+    _, surfaces, extent = turned
+    nonsense = replace(TURN, value=-TURN.value)
+    choices = Choices(Labelling.of(surfaces, extent), [TURN.T, TURN.T, nonsense.T])
+    (usual,) = choices.best(np.full(3, 28.0), None)
+    says = {usual: 5.0, 1 - usual: -3.0}
+    assert told_apart(choices, lambda k, _: says[k], [28, 28, 28], None) == {usual: 28}
+    assert told_apart(choices, lambda k, _: says[k], [28, 28, 20], None) == {1 - usual: 25}
+
+
 def test_something_moved_so_one_motion_is_had_for_half_its_price(turned: Turned) -> None:
     """The blade of a small knife explains 48 points for a price of 50."""
     _, surfaces, extent = turned

@@ -57,6 +57,18 @@ def test_points_beside_the_mask_are_free(sight: Sight, solid: Gaussians) -> None
     assert (answer(above, sight)[:, FREE] >= 8).all()
 
 
+def test_a_pixel_is_the_objects_if_more_than_half_of_it_is(solid: Gaussians) -> None:
+    """Half of it is not: at half the size every other edge would grow by half a pixel."""
+    view = photograph(solid, cameras_around(1, SIZE)[0])
+    for share, known in ((0.5, False), (0.75, True)):
+        alpha = np.zeros((SIZE, SIZE), np.uint8)
+        alpha[::2, ::2] = alpha[1::2, 1::2] = 255
+        alpha[1::2, ::2] = 255 * (share > 0.5)
+        rgba = np.concatenate([view.rgba[..., :3], alpha[..., None]], -1)
+        depth = look(solid, [replace(view, rgba=rgba)], SIZE // 2, TOLERANCE).depth
+        assert (depth != 0).all() == known and (depth != 0).any() == known
+
+
 def test_who_stands_out_of_every_picture_gets_no_answer(solid: Gaussians) -> None:
     one = photograph(solid, look_at(np.array([0.0, -3.0, 0.0]), SIZE))
     behind, aside = [0.0, -4.0, 0.0], [4.0, 0.0, 0.0]

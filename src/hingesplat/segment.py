@@ -71,6 +71,8 @@ DISCOUNT = 2.5
 10 % of those of handles that were alike."""
 RIVALS = 6
 """Motions that are heard in place of each of the best, and of each two of them."""
+HEARINGS = 2
+"""Times at most that rivals are heard, the second time those of what texture left."""
 STAYS = 0.8
 """Share of its price for which a motion stays that was chosen among all: what is worth just that would come and go."""
 MEETING, HANGING_MEETS = 0.5, 0.8
@@ -250,23 +252,35 @@ class _Case:
         """Those of the motions that there are, and what they cost: look-alikes told apart, and what is nearly alike."""
         surfaces, extent, price = self.problem.surfaces, self.evidence.extent, self.config.part_cost
         choices, usual = Choices(self.problem, [m.T for m in motions]), self._prices(motions)
-        rivals = self._rivals(choices, motions, usual)
-        choices, motions = choices.with_more([m.T for m in rivals]), [*motions, *rivals]
-        usual = np.concatenate([usual, self._prices(rivals)])
-        ways = [m.T for m in motions]
-        texture = self._texture_under(ways, photographs, seed)
+        verdicts: dict[tuple[int, bytes, bytes], float] = {}
 
         def verdict(k: int, mine: Pair) -> float:
             """Of the motion that fits these points: one 2 % off would not go along with its own texture."""
-            fit = refit(self.evidence, motions[k], (self.rows[0][mine[0]], self.rows[1][mine[1]]))
-            return against(compared(surfaces, photographs, fit.T, mine, extent, self.config.texture, seed))
+            asked = k, mine[0].tobytes(), mine[1].tobytes()
+            if asked not in verdicts:
+                fit = refit(self.evidence, motions[k], (self.rows[0][mine[0]], self.rows[1][mine[1]]))
+                said = compared(surfaces, photographs, fit.T, mine, extent, self.config.texture, seed)
+                verdicts[asked] = against(said)
+            return verdicts[asked]
+
+        # What texture speaks against, and leaves, may have rivals: a right drawer may be 2 % off, too.
+        kept = choices.best(usual, self.parts)
+        for _ in range(HEARINGS):
+            rivals = self._rivals(choices, motions, kept)
+            choices, motions = choices.with_more([m.T for m in rivals]), [*motions, *rivals]
+            usual = np.concatenate([usual, self._prices(rivals)])
+            told = told_apart(choices, verdict, usual, self.parts)
+            if all(p <= usual[k] for k, p in told.items()):
+                break
+            kept = frozenset(told)
+        ways = [m.T for m in motions]
+        texture = self._texture_under(ways, photographs, seed)
 
         def nearly_alike(k: int, _: float, others: Collection[int], mine: Pair) -> bool:
             """Two drawers pulled out by nearly the same are one to points and colours, or nearly so."""
             points = surfaces[0].points[mine[0]]
             return any(alike(points, ways[j], ways[k], extent) for j in others)
 
-        told = told_apart(choices, verdict, usual, self.parts)
         prices = vouched_for(
             choices, told, nearly_alike, lambda *asked: likeness(texture(*asked)), LEAST * price, self.parts
         )
@@ -276,12 +290,11 @@ class _Case:
         """(motions,) what each costs before texture is asked, in points: odd joints more."""
         return self.config.part_cost * (1 + oddities(self.evidence, motions, self.seeds))
 
-    def _rivals(self, choices: Choices, motions: Sequence[Motion], prices: np.ndarray) -> list[Motion]:
-        """What might stand in place of one or two of the best motions, each fitted to what would be its own then.
+    def _rivals(self, choices: Choices, motions: Sequence[Motion], kept: frozenset[int]) -> list[Motion]:
+        """What might stand in place of one or two of the motions kept, each fitted to what would be its own then.
 
         Look-alikes that meet by chance meet at once; a right motion that is 2 % off explains less than they do.
         """
-        kept = choices.best(prices, self.parts)
         found: dict[int, Motion] = {}
         for out in [*combinations(sorted(kept), 1), *combinations(sorted(kept), 2)]:
             less = kept - set(out)
@@ -345,12 +358,13 @@ class _Case:
                 return chosen
         motions = [*chosen, *others]
         ways = [m.T for m in motions]
+        usual = self._prices(motions)
         texture = self._texture_under(ways, photographs, seed)
 
         def worth(k: int, gain: float, _: Collection[int], mine: Pair) -> bool:
             asked = sum(min(int(m.sum()), self.config.texture.patches) for m in mine)
             along = int((likeness(texture(k, mine)) > GOES_ALONG).sum())
-            return gain > price * (1 - DISCOUNT * along / max(asked, 1))
+            return gain > usual[k] * (1 - DISCOUNT * along / max(asked, 1))
 
         prices = vouched_for(
             Choices(self.problem, ways),

@@ -86,7 +86,8 @@ def told_apart(
         for k in new:
             mine = kept.index(k) + 1
             said[k] = verdict(k, (first == mine, second == mine))
-        if all(against <= DOUBT * usual[k] for k, against in said.items()):
+        # What is odd for a joint is in doubt by that much already.
+        if all(usual[k] + against <= (1 + DOUBT) * usual.min() for k, against in said.items()):
             return {k: float(usual[k]) for k in kept}
         # What has not been asked about may be as good as any.
         prices = LEAST * usual

@@ -24,6 +24,8 @@ from hingesplat.threads import parallel
 
 FREE, SURFACE, HIDDEN, COLOUR = range(4)
 """Columns of ``ask``'s answer."""
+HALF = 128
+"""Alpha above which a pixel is the object's: more than half of it is, rounded or not."""
 BLOCK = 512
 """Points that are asked about at once."""
 
@@ -75,7 +77,7 @@ def look(
     depth, rgb = np.zeros(shape, np.float32), np.ones((*shape, 3), np.float32)
     for i, view in enumerate(photographs):
         r, rgba = render(gaussians, view.camera), torch.from_numpy(view.rgba).float() / 255
-        mask = rgba[..., 3] > 0.5
+        mask = torch.from_numpy(view.rgba[..., 3] > HALF)
         drawn = torch.where(mask & (r.alpha > 0.3), r.depth / r.alpha.clamp_min(1e-3), torch.where(mask, -1.0, 0.0))
         known = _corrected(drawn.numpy(), view.camera, maps[i], maps, 2 * tolerance) if maps else drawn.numpy()
         rows, columns = slice(view.camera.height), slice(view.camera.width)
