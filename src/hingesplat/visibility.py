@@ -24,8 +24,6 @@ from hingesplat.threads import parallel
 
 FREE, SURFACE, HIDDEN, COLOUR = range(4)
 """Columns of ``ask``'s answer."""
-HALF = 128
-"""Alpha above which a pixel is the object's: more than half of it is, rounded or not."""
 BLOCK = 512
 """Points that are asked about at once."""
 
@@ -75,9 +73,10 @@ def look(
     photographs = [downsampled(v, round(max(v.camera.width, v.camera.height) / factor)) for v in views]
     shape = len(views), max(v.camera.height for v in photographs), max(v.camera.width for v in photographs)
     depth, rgb = np.zeros(shape, np.float32), np.ones((*shape, 3), np.float32)
+    half = 127 if factor == 1 else 128  # 128 may be a mean of half, rounded; such pixels would make all things larger.
     for i, view in enumerate(photographs):
         r, rgba = render(gaussians, view.camera), torch.from_numpy(view.rgba).float() / 255
-        mask = torch.from_numpy(view.rgba[..., 3] > HALF)
+        mask = torch.from_numpy(view.rgba[..., 3] > half)
         drawn = torch.where(mask & (r.alpha > 0.3), r.depth / r.alpha.clamp_min(1e-3), torch.where(mask, -1.0, 0.0))
         known = _corrected(drawn.numpy(), view.camera, maps[i], maps, 2 * tolerance) if maps else drawn.numpy()
         rows, columns = slice(view.camera.height), slice(view.camera.width)
