@@ -321,10 +321,10 @@ def propose_hanging(evidence: Evidence, seeds: Sequence[np.ndarray], carriers: S
     Only motions that no joint on the base comes near. A latch fits anywhere on the door that carries it, so what the
     carriers explain is not new.
     """
-    evidence = evidence.left_by(carriers)
     config, least = evidence.config, HANGING * evidence.extent
     if sum(map(len, seeds)) < config.min_points:
         return []
+    evidence = evidence.left_by(carriers)
     pools = [motions[: config.leaders] for carrier in carriers for motions in propose(evidence, seeds, carrier.T)]
     pool = [climbed(evidence, motion, seeds) for motion in chain(*pools)]
     if not pool:

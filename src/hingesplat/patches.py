@@ -174,11 +174,8 @@ def _shown(
     side = int(np.sqrt(np.float64(count)) + 0.5)
     for i in range(thread, points.shape[0], threads):
         x, y, z = _through(T, points[i, 0], points[i, 1], points[i, 2])
-        facing = 0.0
-        for a, towards in enumerate((x, y, z)):
-            turned = T[a, 0] * normals[i, 0] + T[a, 1] * normals[i, 1] + T[a, 2] * normals[i, 2]
-            facing -= turned * towards
-        answer[i] = facing > LEAST_FACING * np.sqrt(x * x + y * y + z * z)
+        nx, ny, nz = _turned(T, normals[i])
+        answer[i] = -(nx * x + ny * y + nz * z) > LEAST_FACING * np.sqrt(x * x + y * y + z * z)
         for cell in (0, side - 1, count // 2, count - side, count - 1):
             if answer[i]:
                 at = points[i, 0] + grid[i, cell, 0], points[i, 1] + grid[i, cell, 1], points[i, 2] + grid[i, cell, 2]
@@ -195,6 +192,16 @@ def _through(T, x, y, z):  # pragma: no cover - compiled
         T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
         T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
         T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
+    )
+
+
+@njit(**INLINE)
+def _turned(T, normal):  # pragma: no cover - compiled
+    """A direction (3,) under the transform (3, 4)."""
+    return (
+        T[0, 0] * normal[0] + T[0, 1] * normal[1] + T[0, 2] * normal[2],
+        T[1, 0] * normal[0] + T[1, 1] * normal[1] + T[1, 2] * normal[2],
+        T[2, 0] * normal[0] + T[2, 1] * normal[1] + T[2, 2] * normal[2],
     )
 
 
@@ -311,9 +318,7 @@ def _seen(
     for k in range(thread, rows.shape[0], threads):
         i, row = rows[k], slot[k]
         normal = normals[i]
-        turned = np.empty(3)
-        for a in range(3):
-            turned[a] = T[a, 0] * normal[0] + T[a, 1] * normal[1] + T[a, 2] * normal[2]
+        nx, ny, nz = _turned(T, normal)
         for c in range(grid.shape[1]):
             off = local[i, 0] * slant[c, 0] + local[i, 1] * slant[c, 1] + local[i, 2] * slant[c, 2]
             px, py, pz = (
@@ -336,7 +341,7 @@ def _seen(
             texture[row, c] = value
             gx, gy = _between(slope[0], left, top, s, t) * fx / z, _between(slope[1], left, top, s, t) * fy / z
             gz = -(gx * x + gy * y) / z
-            by_normal = gx * turned[0] + gy * turned[1] + gz * turned[2]
+            by_normal = gx * nx + gy * ny + gz * nz
             for a in range(3):
                 jacobian[row, c, a] = by_normal * slant[c, a]
             for j in range(slopes.shape[0]):

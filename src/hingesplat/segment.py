@@ -9,7 +9,9 @@ nearest point.
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
+from functools import wraps
 from itertools import combinations
+from typing import TypeVar
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -58,6 +60,9 @@ from hingesplat.texture import (
 )
 from hingesplat.training import evenly
 from hingesplat.visibility import FREE, HIDDEN, ask
+
+Index = TypeVar("Index")
+Said = TypeVar("Said")
 
 ALIKE = 0.06
 """Extents between the places to which two motions take points, in the mean, for them to be nearly the same."""
@@ -224,6 +229,20 @@ def _seed_costs(evidence: Evidence, seeds: Pair, motions: Sequence[Motion]) -> n
     return both_ways(seed_costs, evidence.seen(seeds), motions, evidence.extent)
 
 
+def _said_once(say: Callable[[Index, Pair], Said]) -> Callable[[Index, Pair], Said]:
+    """The same of a motion and what it owns: it is asked more than once, and takes a while to say."""
+    said: dict[tuple[Index, bytes, bytes], Said] = {}
+
+    @wraps(say)
+    def once(k: Index, mine: Pair) -> Said:
+        asked = k, mine[0].tobytes(), mine[1].tobytes()
+        if asked not in said:
+            said[asked] = say(k, mine)
+        return said[asked]
+
+    return once
+
+
 @dataclass(frozen=True)
 class _Case:
     """What decides which motions there are."""
@@ -252,16 +271,12 @@ class _Case:
         """Those of the motions that there are, and what they cost: look-alikes told apart, and what is nearly alike."""
         surfaces, extent, price = self.problem.surfaces, self.evidence.extent, self.config.part_cost
         choices, usual = Choices(self.problem, [m.T for m in motions]), self._prices(motions)
-        verdicts: dict[tuple[int, bytes, bytes], float] = {}
 
+        @_said_once
         def verdict(k: int, mine: Pair) -> float:
             """Of the motion that fits these points: one 2 % off would not go along with its own texture."""
-            asked = k, mine[0].tobytes(), mine[1].tobytes()
-            if asked not in verdicts:
-                fit = refit(self.evidence, motions[k], (self.rows[0][mine[0]], self.rows[1][mine[1]]))
-                said = compared(surfaces, photographs, fit.T, mine, extent, self.config.texture, seed)
-                verdicts[asked] = against(said)
-            return verdicts[asked]
+            fit = refit(self.evidence, motions[k], (self.rows[0][mine[0]], self.rows[1][mine[1]]))
+            return against(compared(surfaces, photographs, fit.T, mine, extent, self.config.texture, seed))
 
         # What texture speaks against, and leaves, may have rivals: a right drawer may be 2 % off, too.
         kept = choices.best(usual, self.parts)
@@ -308,14 +323,11 @@ class _Case:
     ) -> Callable[[int | None, Pair], list[tuple[np.ndarray, float]]]:
         """``compared`` for the points of a motion, under any of the motions (4, 4), or None: to stay."""
         surfaces, extent = self.problem.surfaces, self.evidence.extent
-        said: dict[tuple[int | None, bytes, bytes], list[tuple[np.ndarray, float]]] = {}
 
+        @_said_once
         def texture(k: int | None, mine: Pair) -> list[tuple[np.ndarray, float]]:
-            asked = k, mine[0].tobytes(), mine[1].tobytes()
-            if asked not in said:  # The same is asked more than once, and takes a while to say.
-                T_1_0 = BASE if k is None else ways[k]
-                said[asked] = compared(surfaces, photographs, T_1_0, mine, extent, self.config.texture, seed)
-            return said[asked]
+            T_1_0 = BASE if k is None else ways[k]
+            return compared(surfaces, photographs, T_1_0, mine, extent, self.config.texture, seed)
 
         return texture
 
