@@ -21,7 +21,7 @@ from hingesplat.mesh import (
 from hingesplat.metrics.surface import penetration
 from hingesplat.se3 import matrix_to_wxyz
 from hingesplat.stereo import DepthMap
-from hingesplat.tsdf import DepthView, distance_to, fuse_depth, tangent_planes
+from hingesplat.tsdf import DepthView, distance_to, fuse_depth, tangent_planes, wall_thickness
 from hingesplat.twin import Joint, Part, Twin
 
 
@@ -233,15 +233,16 @@ def test_a_block_is_solid_though_no_camera_sees_its_underside_and_that_is_flat(h
     assert mesh.bounds[0][2] == pytest.approx(-height / 2, abs=0.8 / 48)
 
 
-def test_what_is_unseen_in_the_depth_of_an_open_carcass_is_empty():
-    """Only its back and floor are seen through the opening, and behind the walls there is no more than a wall."""
+@pytest.mark.parametrize(("wall", "resolution"), [(0.04, 48), (0.02, 96)])
+def test_what_is_unseen_in_the_depth_of_an_open_carcass_is_empty(wall: float, resolution: int):
+    """Only its back and floor are seen through the opening; behind the others there is no more than such a wall."""
     lying = trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])
-    carcass = open_box((0.8, 0.8, 0.8), 0.04).apply_transform(lying)
+    carcass = open_box((0.8, 0.8, 0.8), wall).apply_transform(lying)
     front = [c for c in sphere_of_cameras(120) if c.centre[1] < -2.9]
     cameras = front + [c for c in sphere_of_cameras(24) if c.centre[1] > -1]
     maps = [[known_depth(c, carcass) for c in cameras]]
     scene = box_gaussians((0.8, 0.8, 0.8), (0, 0, 0), 0)
-    mesh = mesh_parts(scene, [(cameras, {})], MeshConfig(resolution=48, image_size=96), maps=maps)[0]
+    mesh = mesh_parts(scene, [(cameras, {})], MeshConfig(resolution=resolution, image_size=96), maps=maps)[0]
     assert mesh.is_watertight and mesh.volume == pytest.approx(carcass.volume, rel=0.1)
 
 
@@ -280,6 +281,22 @@ def test_distance_to_another_grid_is_the_least_over_its_poses():
     assert ((found < 0) == (true < 0))[np.abs(true) > 0.01].all()
     assert np.abs(found - true)[(true > -0.03) & (true < 0)].mean() < 0.005
     assert np.isinf(distance_to(grid, grid, [trimesh.transformations.translation_matrix([3, 0, 0])])).all()
+
+
+def test_a_wall_is_as_thick_as_its_two_sides_say_however_it_stands():
+    plate = trimesh.creation.box((1.0, 0.6, 0.06))
+    plate.apply_transform(trimesh.transformations.rotation_matrix(0.4, [1, 0.3, 0.2]))
+    cameras = sphere_of_cameras(60, size=240)
+    lower, shape = plate.bounds[0] - 0.06, tuple(int(n) for n in plate.extents / 0.015 + 9)
+    assert len(shape) == 3
+    both, one = (
+        fuse_depth([traced(c, plate) for c in some], lower, shape, 0.015, 0.03)
+        for some in (cameras, [c for c in cameras if c.centre @ np.array([0, 0, 1]) > 1])
+    )
+    known = wall_thickness(both, 0.1)
+    assert np.median(known) == pytest.approx(0.06, rel=0.1) and known.max() <= 0.1
+    assert len(wall_thickness(both, 0.03)) < 0.05 * len(known)
+    assert len(wall_thickness(one, 0.1)) < 0.1 * len(known)
 
 
 def test_tangent_planes_are_those_of_a_slanted_wall_whatever_stands_behind_it():

@@ -2,8 +2,9 @@
 
 Depth is that of stereo where it is known, else that of the Gaussians unless stereo sees through it: fits put lids on
 hollows. A view of any state carves a part in the part's own frame. What no view ever saw is solid behind the surfaces
-that were seen, as thick as a wall, and farther in where these close around it; but two parts are never in one place, so
-the base has room for its movers all along their way.
+that were seen, as thick as a wall, and farther in where these close around it; what they leave open is empty, behind
+walls as thick as those that were seen from both sides. But two parts are never in one place, so the base has room for
+its movers all along their way.
 """
 
 import logging
@@ -26,7 +27,7 @@ from hingesplat.render import rasterize
 from hingesplat.screw import slide_of
 from hingesplat.se3 import wxyz_to_matrix
 from hingesplat.stereo import DepthMap, contradicted, cubes
-from hingesplat.tsdf import DepthView, DistanceGrid, distance_to, fuse_depth, tangent_planes
+from hingesplat.tsdf import DepthView, DistanceGrid, distance_to, fuse_depth, tangent_planes, wall_thickness
 
 log = logging.getLogger(__name__)
 
@@ -34,6 +35,8 @@ MOST = 0.5
 """Share of a part that must lie within the convex hull of what was seen of it for that to be its bound."""
 HOLLOW = 0.2
 """An unseen pocket is empty where more than this share of what borders on it was seen to be."""
+TWO_SIDED = 0.01
+"""Places where a wall was seen from both sides, of those of the surface, from which on they tell how thick it is."""
 DENSE, WIDER = 0.15, 1.2
 """Share of the cells that pixels fall into that three of them must see, and the factor by which cells grow for that. Of
 parts of two objects it was 0.19 to 0.62, but 0.007 of a small drawer."""
@@ -167,7 +170,7 @@ def _solids(
     for i in grids.keys() - {0}:
         T_base_mover = [p.get(i, np.eye(4)) for p in poses]
         mover = _filled(grids[i], surfaces[i], config, bounded=slide_of(T_base_mover) is None)
-        walls = _wall(surfaces[i], config), _wall(surfaces[0], config)
+        walls = _reach(surfaces[i], config), _reach(surfaces[0], config)
         mover = drawn_out(mover, surfaces[i], surfaces[0], T_base_mover, walls)
         taken = -distance_to(mover, known, [np.linalg.inv(T) for T in T_base_mover]) / mover.truncation
         guess = np.maximum(mover.distance, np.minimum(taken, 1))
@@ -195,8 +198,9 @@ def _filled(grid: DistanceGrid, surface: np.ndarray, config: MeshConfig, *, boun
     side.
     """
     hull = _hull_distance(surface, grid.lower, grid.distance.shape, grid.voxel)
-    unseen = grid.weight == 0
-    solid = _solid_unseen(grid.distance, unseen, hull <= 1, surface, grid.lower, grid.voxel, _wall(surface, config))
+    unseen, reach = grid.weight == 0, _reach(surface, config)
+    wall = min(reach, _thickness(grid, surface, reach))
+    solid = _solid_unseen(grid.distance, unseen, hull <= 1, surface, grid.lower, grid.voxel, reach, wall)
     distance = np.where(unseen, np.where(solid, -1, 1), grid.distance).astype(np.float32)
     if bounded:
         within = np.maximum(distance, np.clip(hull * (grid.voxel / grid.truncation), -1, 1))
@@ -205,9 +209,15 @@ def _filled(grid: DistanceGrid, surface: np.ndarray, config: MeshConfig, *, boun
     return replace(grid, distance=ndimage.gaussian_filter(distance, 0.7))
 
 
-def _wall(surface: np.ndarray, config: MeshConfig) -> float:
-    """How thick the walls of a part count where nobody saw: its surface is (n, 3)."""
+def _reach(surface: np.ndarray, config: MeshConfig) -> float:
+    """How thick the walls of a part count where nobody saw, scene units: its surface is (n, 3)."""
     return config.reach * float(np.ptp(surface, axis=0).max())
+
+
+def _thickness(grid: DistanceGrid, surface: np.ndarray, reach: float) -> float:
+    """How thick the walls of a part are where they were seen from both sides; ``reach`` where that is too rare."""
+    known = wall_thickness(grid, 2 * reach)
+    return float(np.median(known)) if len(known) > TWO_SIDED * len(surface) else reach
 
 
 def _solid_unseen(
@@ -218,19 +228,28 @@ def _solid_unseen(
     lower: np.ndarray,
     voxel: float,
     reach: float,
+    wall: float,
 ) -> np.ndarray:
     """Which unseen voxels belong to the part: those of its walls, and pockets that these close.
 
-    Walls are ``reach`` thick and stand on the surface (n, 3) and, as what it stands on is rarely photographed, on its
-    convex ``hull``. A pocket between them is empty where it lies open towards space that was seen to be empty.
+    Walls stand on the surface (n, 3) and, as what it stands on is rarely photographed, on its convex ``hull``. What
+    lies deeper than ``reach`` behind them is a pocket. It is empty where it lies open towards space that was seen to be
+    empty, and then it is as large as walls of the thickness ``wall`` leave it.
     """
     inside = unseen & hull
     index = np.argwhere(inside)
     away, _ = KDTree(surface).query(lower + voxel * index, distance_upper_bound=reach, workers=torch.get_num_threads())
-    wall = inside & ~np.asarray(ndimage.binary_erosion(hull, iterations=max(round(reach / voxel), 1)), bool)
-    wall[tuple(index.T)] |= np.isfinite(away)
+
+    def walls(thickness: float) -> np.ndarray:
+        """The unseen voxels of walls of that thickness."""
+        of_hull = np.asarray(ndimage.binary_erosion(hull, iterations=max(round(thickness / voxel), 1)), bool)
+        solid = inside & ~of_hull
+        solid[tuple(index.T)] |= away <= thickness
+        return solid
+
+    thick = walls(reach)
     pocket = np.zeros(distance.shape, np.int32)
-    ndimage.label(inside & ~wall, output=pocket)
+    ndimage.label(inside & ~thick, output=pocket)
     count = int(pocket.max()) + 1
     seen = ~unseen & ndimage.binary_erosion(hull, iterations=4)
 
@@ -239,9 +258,13 @@ def _solid_unseen(
         shifted = (np.roll(side, shift, axis) for axis in range(3) for shift in (1, -1))
         return np.sum([np.bincount(pocket[s], minlength=count) for s in shifted], axis=0)
 
-    open_, closed = borders(seen & (distance > 0)), borders(wall | (~unseen & (distance <= 0)))
+    open_, closed = borders(seen & (distance > 0)), borders(thick | (~unseen & (distance <= 0)))
     hollow = open_ > HOLLOW * (open_ + closed)
-    return wall | (inside & ~hollow[pocket])
+    hollow[0] = False
+    empty, deeper = hollow[pocket], max(round((reach - wall) / voxel), 0)
+    if deeper and empty.any():
+        empty = ndimage.binary_dilation(empty, iterations=deeper, mask=inside & ~walls(wall))
+    return inside & ~empty
 
 
 def hull_mesh(gaussians: Gaussians) -> trimesh.Trimesh:

@@ -96,6 +96,15 @@ def distance_to(grid: DistanceGrid, other: DistanceGrid, T_grid_other: Sequence[
     return nearest * np.float32(other.truncation)
 
 
+def wall_thickness(grid: DistanceGrid, most: float) -> np.ndarray:
+    """(n,) how thick walls up to ``most`` are, scene units, at each place where both of their sides were seen.
+
+    Along every line of the grid: from where seen space turns solid to where it is empty again, times the cosine between
+    the line and the wall's normal. Lines that meet a side at less than 45° do not count.
+    """
+    return np.array(_walls(grid.distance, grid.weight, most / grid.voxel), float) * grid.voxel
+
+
 def tangent_planes(camera: Camera, depth: np.ndarray, jump: float) -> np.ndarray:
     """The plane at each pixel of a depth map: (height, width, 5) float32, normal, offset, weight.
 
@@ -215,3 +224,48 @@ def _lower(nearest, distance, T, thread, threads):  # pragma: no cover
                         s = (u if p else 1 - u) * (v if q else 1 - v)
                         d += s * ((1 - w) * distance[a + p, b + q, c] + w * distance[a + p, b + q, c + 1])
                 nearest[i, j, k] = min(nearest[i, j, k], d)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _walls(distance, weight, most):  # pragma: no cover
+    """What ``wall_thickness`` gives, in voxels."""
+    found = [np.float64(0) for _ in range(0)]
+    shape = distance.shape
+    for axis in range(3):
+        x, y, z = np.int64(axis == 0), np.int64(axis == 1), np.int64(axis == 2)
+        for i in range(shape[0] - x):
+            for j in range(shape[1] - y):
+                for k in range(shape[2] - z):
+                    if weight[i, j, k] == 0 or weight[i + x, j + y, k + z] == 0:
+                        continue
+                    before, first = distance[i, j, k], distance[i + x, j + y, k + z]
+                    if before < 0 or first >= 0:
+                        continue
+                    room = (x * (shape[0] - i) + y * (shape[1] - j) + z * (shape[2] - k)) - 1
+                    n = 2
+                    while n <= room and n < most + 2 and distance[i + n * x, j + n * y, k + n * z] < 0:
+                        n += 1
+                    if n > room:
+                        continue
+                    a, b, c = i + n * x, j + n * y, k + n * z
+                    last, after = distance[a - x, b - y, c - z], distance[a, b, c]
+                    if after < 0 or weight[a, b, c] == 0 or weight[a - x, b - y, c - z] == 0:
+                        continue
+                    cosine = min(
+                        _steepness(distance, i + x, j + y, k + z, axis), _steepness(distance, a - x, b - y, c - z, axis)
+                    )
+                    thickness = (n - 1 + last / (last - after) - before / (before - first)) * cosine
+                    if cosine > 0.7 and thickness <= most:
+                        found.append(thickness)
+    return found
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _steepness(distance, i, j, k, axis):  # pragma: no cover
+    """How much of the gradient at a voxel lies along an axis, 0 to 1."""
+    nx, ny, nz = distance.shape
+    x = distance[min(i + 1, nx - 1), j, k] - distance[max(i - 1, 0), j, k]
+    y = distance[i, min(j + 1, ny - 1), k] - distance[i, max(j - 1, 0), k]
+    z = distance[i, j, min(k + 1, nz - 1)] - distance[i, j, max(k - 1, 0)]
+    along = x if axis == 0 else y if axis == 1 else z
+    return abs(along) / max(np.sqrt(x * x + y * y + z * z), 1e-6)
