@@ -240,16 +240,15 @@ def _solid_unseen(
     index = np.argwhere(inside)
     away, _ = KDTree(surface).query(lower + voxel * index, distance_upper_bound=reach, workers=torch.get_num_threads())
 
-    def walls(thickness: float) -> np.ndarray:
-        """The unseen voxels of walls of that thickness."""
-        of_hull = np.asarray(ndimage.binary_erosion(hull, iterations=max(round(thickness / voxel), 1)), bool)
-        solid = inside & ~of_hull
-        solid[tuple(index.T)] |= away <= thickness
-        return solid
+    def behind(thickness: float) -> np.ndarray:
+        """The unseen voxels that lie deeper than walls of that thickness."""
+        deep = inside & np.asarray(ndimage.binary_erosion(hull, iterations=max(round(thickness / voxel), 1)), bool)
+        deep[tuple(index.T)] &= np.asarray(away) > thickness
+        return deep
 
-    thick = walls(reach)
+    deep = behind(reach)
     pocket = np.zeros(distance.shape, np.int32)
-    ndimage.label(inside & ~thick, output=pocket)
+    ndimage.label(deep, output=pocket)
     count = int(pocket.max()) + 1
     seen = ~unseen & ndimage.binary_erosion(hull, iterations=4)
 
@@ -258,12 +257,12 @@ def _solid_unseen(
         shifted = (np.roll(side, shift, axis) for axis in range(3) for shift in (1, -1))
         return np.sum([np.bincount(pocket[s], minlength=count) for s in shifted], axis=0)
 
-    open_, closed = borders(seen & (distance > 0)), borders(thick | (~unseen & (distance <= 0)))
+    open_, closed = borders(seen & (distance > 0)), borders((inside & ~deep) | (~unseen & (distance <= 0)))
     hollow = open_ > HOLLOW * (open_ + closed)
     hollow[0] = False
-    empty, deeper = hollow[pocket], max(round((reach - wall) / voxel), 0)
-    if deeper and empty.any():
-        empty = ndimage.binary_dilation(empty, iterations=deeper, mask=inside & ~walls(wall))
+    empty, more = hollow[pocket], max(round((reach - wall) / voxel), 0)
+    if more and empty.any():
+        empty = np.asarray(ndimage.binary_dilation(empty, iterations=more, mask=behind(wall)), bool)
     return inside & ~empty
 
 
