@@ -5,8 +5,10 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
+import manifold3d
 import numpy as np
 import pytest
 import torch
@@ -442,6 +444,9 @@ def test_a_mesh_is_simplified_to_the_triangles_allowed():
     assert (red == (small.vertices[:, 2] > 0)).all()
 
 
+TRAPEZE = np.array([[0, 0, 0], [0.1, 0, 0.8], [0.4, 0, 0.8], [0.5, 0, 0], [0, 0, 0]])
+
+
 def test_collision_hulls_are_convex_cover_the_mesh_and_are_cached(tmp_path: Path, monkeypatch):
     ell = trimesh.boolean.union(
         [box((1, 0.2, 0.2), (0, 0, 0), (9, 9, 9)), box((0.2, 0.2, 1), (0.4, 0, 0.4), (9, 9, 9))]
@@ -453,6 +458,20 @@ def test_collision_hulls_are_convex_cover_the_mesh_and_are_cached(tmp_path: Path
     monkeypatch.setattr("hingesplat.export.solids._convex_pieces", lambda *_: pytest.fail("cut again"))
     again = collision_hulls(ell, tmp_path)
     assert [h.volume for h in again] == pytest.approx([h.volume for h in hulls])
+
+
+def test_collision_hulls_cover_thin_things_and_do_not_bulge_far(tmp_path: Path):
+    """The coarse copy that is cut must not lose half of a panel, nor a bar."""
+    frame = [trimesh.creation.cylinder(0.012, segment=[a, b], sections=12) for a, b in pairwise(TRAPEZE)]
+    bars = trimesh.boolean.union([*frame, trimesh.creation.icosphere(3, 0.02)])
+    panel = trimesh.creation.icosphere(5).apply_scale((0.5, 0.4, 0.01))
+    for mesh in (bars.subdivide_to_size(0.03, max_iter=20), panel):
+        mesh.merge_vertices()
+        hulls = [manifold(h) for h in collision_hulls(mesh, tmp_path)]
+        whole = manifold3d.Manifold.batch_boolean([h for h in hulls if h], manifold3d.OpType.Add)
+        solid = manifold(mesh)
+        assert solid and (solid - whole).volume() < 0.005 * solid.volume()
+        assert whole.volume() < 2 * solid.volume()
 
 
 @pytest.mark.parametrize("end", ["import os; os.abort()", "raise RuntimeError('no luck')"])

@@ -19,8 +19,8 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 
 from hingesplat.files import whole_file
 
-COARSE = 0.015
-"""Of a mesh's size: what may be shaved off where only the rough shape counts."""
+COARSE, THIN = 0.015, 0.25
+"""Of a mesh's size, and of how thick it is: what may be shaved off where only the rough shape counts."""
 
 log = logging.getLogger(__name__)
 
@@ -86,20 +86,21 @@ CONVEX = Path(__file__).with_name("convex.py")
 
 
 def collision_hulls(mesh: trimesh.Trimesh, cache: Path, *, most: int = 12) -> tuple[trimesh.Trimesh, ...]:
-    """Convex pieces that cover a closed mesh (CoACD, seeded); its one convex hull where that fails.
+    """Convex pieces that cover a closed mesh (CoACD, seeded, on a coarse copy); its one convex hull where that fails.
 
     ``cache`` is a folder of ``HASH.npz`` files: the same mesh is cut only once in the same way.
     """
     vertices = np.ascontiguousarray(mesh.vertices, np.float64)
     faces = np.ascontiguousarray(mesh.faces, np.int32)
-    key = hashlib.sha256(vertices.tobytes() + faces.tobytes() + f"{most} {DECOMPOSITION}".encode()).hexdigest()[:16]
+    how = f"{most} {COARSE} {THIN} {DECOMPOSITION}".encode()
+    key = hashlib.sha256(vertices.tobytes() + faces.tobytes() + how).hexdigest()[:16]
     file = cache / f"{key}.npz"
     with suppress(OSError, ValueError, EOFError), np.load(file, allow_pickle=False) as data:
         return tuple(_as_trimesh(manifold3d.Manifold.hull_points(data[name])) for name in sorted(data.files))
     least = 1e-9 * np.ptp(vertices, axis=0).max() ** 3  # Some pieces are flat.
     solids = [manifold3d.Manifold.hull_points(points) for points in _convex_pieces(mesh, most)]
     hulls = [_as_trimesh(solid) for solid in solids if solid.volume() > least]
-    hulls = hulls or [mesh.convex_hull]
+    hulls = _covering(hulls, vertices) if hulls else [mesh.convex_hull]
     with suppress(OSError):  # A folder that cannot be written costs only time.
         cache.mkdir(parents=True, exist_ok=True)
         with whole_file(file) as tmp, tmp.open("wb") as opened:  # Given a name, savez would add a suffix.
@@ -127,6 +128,15 @@ def _convex_pieces(mesh: trimesh.Trimesh, most: int) -> list[np.ndarray]:
             told = done.stderr.strip().rpartition("\n")[2] or f"exit code {done.returncode}"
     log.warning("convex decomposition failed (%s); the convex hull stands in", told)
     return []
+
+
+def _covering(hulls: Sequence[trimesh.Trimesh], points: np.ndarray) -> list[trimesh.Trimesh]:
+    """The hulls, each with those of the points (n, 3) outside of all that stick out of it the least."""
+    facets = [(h.face_normals, (h.face_normals * h.triangles[:, 0]).sum(1)) for h in hulls]
+    out = np.stack([(points @ normals.T - offsets).max(1) for normals, offsets in facets])
+    nearest = np.where(out.min(0) > 0, out.argmin(0), -1)
+    grown = (np.concatenate([h.vertices, points[nearest == k]]) for k, h in enumerate(hulls))
+    return [_as_trimesh(manifold3d.Manifold.hull_points(p)) for p in grown]
 
 
 def free_range(
@@ -189,7 +199,8 @@ def _coarse(mesh: trimesh.Trimesh) -> manifold3d.Manifold:
     """A closed mesh simplified, ten times faster to cut and to sweep."""
     solid = manifold(mesh)
     assert solid is not None
-    coarse = solid.simplify(COARSE * float(np.ptp(mesh.vertices, axis=0).max()))
+    thickness = 2 * solid.volume() / solid.surface_area()
+    coarse = solid.simplify(min(COARSE * float(np.ptp(mesh.vertices, axis=0).max()), THIN * thickness))
     return solid if coarse.is_empty() else coarse
 
 
