@@ -21,7 +21,7 @@ def strip(gap_after: int, colours: np.ndarray | None = None) -> Surface:
     x = x + np.where(gap_after < THIRDS, 0.012, 0)
     points = np.stack([x, y, 0 * x], 1)
     grey = np.full((90, 3), 0.5) if colours is None else colours
-    return Surface(points, grey, np.tile([0.0, 0, 1], (90, 1)), NOBODY)
+    return Surface(points, grey, np.tile([0.0, 0, 1], (90, 1)), np.zeros(90), NOBODY)
 
 
 def labelled(

@@ -27,7 +27,8 @@ def tray(depth: float) -> np.ndarray:
 
 def surface(points: np.ndarray) -> Surface:
     nobody = Sight(np.zeros((0, 3, 4)), np.zeros((0, 1, 1), np.float32), np.zeros((0, 1, 1, 3), np.float32), 0.01)
-    return Surface(points, np.full((len(points), 3), 0.5), np.tile([0.0, 0, 1], (len(points), 1)), nobody)
+    n = len(points)
+    return Surface(points, np.full((n, 3), 0.5), np.tile([0.0, 0, 1], (n, 1)), np.zeros(n), nobody)
 
 
 @pytest.mark.parametrize("hides", [True, False])

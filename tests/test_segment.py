@@ -60,7 +60,7 @@ from hingesplat.segment import (
 from hingesplat.simd import LANES
 from hingesplat.states import segment_states, track
 from hingesplat.stereo import Cloud, DepthMap, StereoConfig, depth_map, stereo
-from hingesplat.surface import Labels, Surface, bounds, components, surface_of, thin
+from hingesplat.surface import Labels, Surface, bounds, components, free_share, surface_of, thin
 from hingesplat.texture import told_apart, vouched_for
 from hingesplat.visibility import FREE, HIDDEN, SURFACE, Sight, ask
 from scenes import (
@@ -110,7 +110,8 @@ def made_maps(kind: Literal["revolute", "prismatic"]) -> tuple[list[DepthMap], l
 
 def plain(points: np.ndarray, sight: Sight = NO_SIGHT) -> Surface:
     """Grey points, flat in z, that no camera sees but those of ``sight``."""
-    return Surface(points, np.full(points.shape, 0.5), np.tile([0.0, 0, 1], (len(points), 1)), sight)
+    grey = np.full(points.shape, 0.5)
+    return Surface(points, grey, np.tile([0.0, 0, 1], (len(points), 1)), free_share(ask(points, grey, sight)), sight)
 
 
 def patch(centre: tuple[float, float, float], n: int = 15, spacing: float = 0.01) -> np.ndarray:

@@ -46,7 +46,7 @@ def test_a_motion_is_corrected_by_the_texture_it_carries(kind: str) -> None:
     tilted = right.axis + 0.009 * np.array([1.0, 0, 0])
     aside = PIVOT + 0.004 * np.array([1.0, 0, 0])
     off = replace(right, axis=tilted / np.linalg.norm(tilted), pivot=aside, value=value + 0.006)
-    surface = Surface(POINTS, 0 * POINTS, EITHER_SIDE, cast(Sight, None))
+    surface = Surface(POINTS, 0 * POINTS, EITHER_SIDE, 0 * POINTS[:, 0], cast(Sight, None))
     found = fitted(off, surface, photographs(kind, part=0), 1.0)
 
     def error(motion: Motion) -> float:
@@ -66,8 +66,8 @@ def test_the_texture_that_one_state_shows_of_a_part_corrects_its_motion(shows: i
     """In the other nothing is labelled as the part's."""
     exact = place("prismatic")(STILL)[1]
     right = Motion("prismatic", FORWARD, PIVOT, SLIDE, 1.0)
-    there = Surface(moved(POINTS, exact), 0 * POINTS, EITHER_SIDE, cast(Sight, None))
-    surfaces = Surface(POINTS, 0 * POINTS, EITHER_SIDE, cast(Sight, None)), there
+    there = Surface(moved(POINTS, exact), 0 * POINTS, EITHER_SIDE, 0 * POINTS[:, 0], cast(Sight, None))
+    surfaces = Surface(POINTS, 0 * POINTS, EITHER_SIDE, 0 * POINTS[:, 0], cast(Sight, None)), there
     labels = [np.full(len(POINTS), int(s == shows)) for s in (0, 1)]
     case = SimpleNamespace(
         problem=SimpleNamespace(surfaces=surfaces, labels=lambda _: labels),

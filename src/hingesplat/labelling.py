@@ -218,7 +218,13 @@ class Labelling:
 
     def labels(self, T_1_0: Sequence[np.ndarray]) -> Labels:
         """Labels of both states' points under these motions, all of which stay."""
-        return self.mean_field(self.costs(T_1_0), self.partners(T_1_0))[0]
+        return self.labels_and_meeting(T_1_0)[0]
+
+    def labels_and_meeting(self, T_1_0: Sequence[np.ndarray]) -> tuple[Labels, np.ndarray]:
+        """The same, and ``meeting`` of each motion."""
+        partners = self.partners(T_1_0)
+        owned = self.mean_field(self.costs(T_1_0), partners)[0]
+        return owned, meeting(partners, owned)
 
 
 def meeting(partners: Sequence[np.ndarray], owned: Labels) -> np.ndarray:

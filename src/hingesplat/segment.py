@@ -29,7 +29,7 @@ from hingesplat.hypotheses import (
     propose_hanging,
     refit,
 )
-from hingesplat.labelling import Choices, Labelling, meeting, seed_costs, whereabouts_under
+from hingesplat.labelling import Choices, Labelling, seed_costs, whereabouts_under
 from hingesplat.patches import Photograph
 from hingesplat.pieces import (
     follow_fronts,
@@ -404,9 +404,7 @@ class _Case:
         if not hanging:
             return chosen
         more = self.settled([*chosen, *hanging], [self.config.hanging_cost] * (len(chosen) + len(hanging)))
-        ways = [m.T for m in more]
-        partners = self.problem.partners(ways)
-        share = meeting(partners, self.problem.mean_field(self.problem.costs(ways), partners)[0])
+        share = self.problem.labels_and_meeting([m.T for m in more])[1]
         kept = [m for m, s in zip(more, share, strict=True) if s > HANGING_MEETS or carrier_of(m, more) is None]
         return kept if any(carrier_of(m, kept) is not None for m in kept) else chosen
 
@@ -450,12 +448,10 @@ def _labelled(
     """The parts that these motions make, each one piece, and labels of all points of both states."""
     problem = Labelling.of(surfaces, extent)
     while True:
-        transforms = [m.T for m in motions]
-        partners = problem.partners(transforms)
-        owned = problem.mean_field(problem.costs(transforms), partners)[0]
+        owned, met = problem.labels_and_meeting([m.T for m in motions])
         share = lying_on(owned, surfaces, extent)
         own_joint = np.array([not m.by_texture and carrier_of(m, motions) is None for m in motions], float)
-        doubts = MEETING - meeting(partners, owned), passed_on(share) - PASSED_ON, own_joint * riding(share) - RIDING
+        doubts = MEETING - met, passed_on(share) - PASSED_ON, own_joint * riding(share) - RIDING
         doubt = np.max(doubts, axis=0)
         if doubt.max(initial=0) <= 0:
             break

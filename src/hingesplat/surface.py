@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -31,21 +30,19 @@ class Surface:
     """(n, 3)"""
     normals: np.ndarray
     """(n, 3) unit, either side."""
+    free_at_home: np.ndarray
+    """(n,) ``free_share`` of the points in their own photographs: fits and stereo stick out a little."""
     sight: Sight
 
     def rows(self, index: np.ndarray) -> "Surface":
         """The subset ``index``, seen by the same cameras."""
-        return Surface(self.points[index], self.colours[index], self.normals[index], self.sight)
+        free = self.free_at_home[index]
+        return Surface(self.points[index], self.colours[index], self.normals[index], free, self.sight)
 
     def blurred(self, k: int = 8) -> np.ndarray:
         """(n, 3) mean colour of each point and its neighbours: what a coarse voxel would show."""
         index = np.asarray(KDTree(self.points).query(self.points, min(k, len(self.points)))[1])
         return self.colours[index.reshape(len(self.points), -1)].mean(1)
-
-    @cached_property
-    def free_at_home(self) -> np.ndarray:
-        """(n,) ``free_share`` of the points in their own photographs: fits and stereo stick out a little."""
-        return free_share(ask(self.points, self.colours, self.sight))
 
     @property
     def cloud(self) -> Cloud:
@@ -91,8 +88,8 @@ def surface_of(
     if len(cloud):
         alone &= KDTree(cloud.points).query(points)[0] > 2 * spacing
     cloud = cloud.joined(Cloud(points[alone], normals_of(gaussians)[alone], colours[alone]))
-    surface = Surface(cloud.points, cloud.colours, cloud.normals, sight)
-    answer = ask(surface.points, surface.colours, sight)
+    answer = ask(cloud.points, cloud.colours, sight)
+    surface = Surface(cloud.points, cloud.colours, cloud.normals, free_share(answer), sight)
     views_of_it = answer[:, : HIDDEN + 1].sum(1)
     return surface.rows(np.flatnonzero((answer[:, SURFACE] >= 2) & (answer[:, FREE] <= 0.15 * views_of_it)))
 
