@@ -115,13 +115,17 @@ def test_what_is_no_drawer_stays_as_it_is(why: str) -> None:
     assert drawn_out(part, tray(0.15), back, [np.eye(4), way], (0.02, 0.04)) is part
 
 
-def test_a_drawer_whose_back_was_seen_ends_there() -> None:
-    u = np.linspace(-0.23, 0.23, 30)
-    back = np.stack([u, 0 * u + 0.3, 0 * u + 0.06], 1)
-    found = drawn_out(grid(), np.concatenate([tray(0.15), back]), BACK, [np.eye(4), OUT], (0.02, 0.04))
-    assert solid_at(found, 0, 0.31, 0.1) and not solid_at(found, 0, 0.35, 0)
-    narrow = np.concatenate([tray(0.15), back[12:18], back[12:18]])  # Something in it.
-    assert solid_at(drawn_out(grid(), narrow, BACK, [np.eye(4), OUT], (0.02, 0.04)), 0, 0.6, 0)
+def test_a_drawer_whose_back_was_seen_ends_there_but_no_strip_of_its_floor_is_a_back() -> None:
+    u, z = (a.ravel() for a in np.meshgrid(np.linspace(-0.23, 0.23, 30), np.linspace(0.03, 0.15, 8), indexing="ij"))
+    back = np.stack([u, 0 * u + 0.3, z], 1)
+
+    def ends_with(more: np.ndarray) -> bool:
+        found = drawn_out(grid(), np.concatenate([tray(0.15), more]), BACK, [np.eye(4), OUT], (0.02, 0.04))
+        return solid_at(found, 0, 0.31, 0.1) and not solid_at(found, 0, 0.35, 0)
+
+    assert ends_with(back)
+    assert not ends_with(back[12 * 8 : 18 * 8])  # Something in it.
+    assert not ends_with(back[z < 0.06])
 
 
 @pytest.mark.parametrize("way", [[1, 0, 0], [0, -1, 0]])

@@ -28,8 +28,8 @@ OFTEN = 0.25
 """Share of the slices that show most of its cells in which a cell of it must have been seen."""
 WHOLE = 0.9
 """Share of its walls that a slice must show to be the last that counts, of those that the best slice shows."""
-SPAN = 0.6
-"""Share of an outline's width that a back spans; what spans less is something in the drawer."""
+SPAN, RISE = 0.6, 0.3
+"""Shares of an outline's width and height that a back spans; what spans less is in the drawer, or a strip of floor."""
 STRAY = 0.02
 """Share of a surface that may lie deeper than its last cross-section."""
 MARGIN = 3
@@ -146,7 +146,7 @@ def drawn_out(
         inside = box[(box @ inwards > start) & _inner(outline, box @ across.T)]
         for back in np.arange(end, start, -own):  # Its own back, if that was seen.
             face = inside[np.abs(inside @ inwards - back) < own / 2]
-            if len(face) >= FEWEST and _widest(face @ across.T) > SPAN * _widest(outline.points):
+            if len(face) >= FEWEST and _spans(face @ across.T, outline.points):
                 end = float(np.median(face @ inwards)) + own
                 break
         if end > start + 2 * own:
@@ -168,6 +168,11 @@ def _narrowest(flat: np.ndarray) -> float:
 def _widest(flat: np.ndarray) -> float:
     """Extent of points (n, 2) along the axis along which it is the larger."""
     return float(np.ptp(flat, axis=0).max())
+
+
+def _spans(flat: np.ndarray, outline: np.ndarray) -> bool:
+    """Whether points (n, 2) are as large as a back within an outline (m, 2)."""
+    return _widest(flat) > SPAN * _widest(outline) and _narrowest(flat) > RISE * _narrowest(outline)
 
 
 def _outline(flat: np.ndarray) -> Delaunay:
