@@ -114,18 +114,18 @@ def test_a_patch_that_pulls_elsewhere_hardly_counts() -> None:
     stiff = np.stack([np.diag(rng.uniform(0.5, 2, 2)) for _ in range(40)])
     target = np.array([0.3, -0.2]) + 0.02 * rng.normal(size=(40, 2))
     off, weak = np.zeros(2), 1e-9 * np.eye(2)
-    honest, sure = _agreed(-np.einsum("nkl,nl->nk", stiff, target), stiff, off, weak)
+    honest, sure = _agreed(-np.einsum("nkl,nl->nk", stiff, target), stiff, off, weak, 1)
     np.testing.assert_allclose(honest, [0.3, -0.2], atol=0.02)
     target[:3] += 5
-    robust, less = _agreed(-np.einsum("nkl,nl->nk", stiff, target), stiff, off, weak)
+    robust, less = _agreed(-np.einsum("nkl,nl->nk", stiff, target), stiff, off, weak, 1)
     np.testing.assert_allclose(robust, [0.3, -0.2], atol=0.05)
     assert np.trace(less) > np.trace(sure)
-    assert np.linalg.norm(_agreed(-stiff @ [0.3, -0.2], stiff, off, 1e9 * np.eye(2))[0]) < 1e-3
+    assert np.linalg.norm(_agreed(-stiff @ [0.3, -0.2], stiff, off, 1e9 * np.eye(2), 1)[0]) < 1e-3
 
 
 def test_a_patch_whose_curvature_rounds_below_zero_does_no_harm() -> None:
     """A fridge's door ended in a square root of less than nothing."""
     stiff = np.array([np.diag([1.0, 1.0])] * 4 + [np.diag([1.0, -1e-6])])
     pull = np.array([[0.1, 0.1], [-0.1, 0.1], [0.1, -0.1], [-0.1, -0.1], [0.0, 1.0]])
-    step, covariance = _agreed(pull, stiff, np.zeros(2), np.eye(2))
+    step, covariance = _agreed(pull, stiff, np.zeros(2), np.eye(2), 1)
     assert np.isfinite(step).all() and (np.linalg.eigvalsh(covariance) > 0).all()

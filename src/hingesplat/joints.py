@@ -348,8 +348,9 @@ def _by_patches(
         if patches is not None:
             start = poses.theta[j].detach().cpu().double().numpy()
             known = np.linalg.inv(covariance[j])
+            place = partial(poses.place, j)
             theta, settled[j] = adjust(
-                patches, photographs, partial(poses.place, j), start, known, poses.extent, config.rounds
+                patches, photographs, place, start, known, poses.extent, config.rounds, config.alike
             )
             settled[j] += left[j]
             with torch.no_grad():

@@ -34,8 +34,6 @@ DEEP, TILTED = 1.2, 0.3
 """How far patches lie off the drawn surface, in pixels, and how much they tilt, as a slope: standard deviations."""
 NEAR = 0.015
 """Extents from the drawn surface within which a patch is on it."""
-COUNT_AS_ONE = 20.0
-"""Patches side by side err alike: so many count as one in standard deviations."""
 STEP = 1e-3
 """For derivatives of poses, radians and extents."""
 
@@ -52,6 +50,8 @@ class PatchConfig:
     """Photographs of each state that are matched, about."""
     rounds: int = 5
     """Of Gauss-Newton."""
+    alike: float = 20.0
+    """Patches side by side err alike, as a highlight lies on all of them: so many count as one."""
 
 
 @dataclass(frozen=True)
@@ -213,6 +213,7 @@ def adjust(
     precision: np.ndarray,
     extent: float,
     rounds: int,
+    alike: float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The numbers of a part's joint that make its patches look alike in all photographs, by Gauss-Newton.
 
@@ -223,6 +224,7 @@ def adjust(
         precision: (p, p) how well that is known: an inverse covariance.
         extent: of the object.
         rounds: of Gauss-Newton.
+        alike: so many patches count as one beside what is known.
 
     Returns:
         The numbers, and their covariance (p, p) by how far patches disagree.
@@ -252,7 +254,7 @@ def adjust(
         back = np.linalg.solve(H[:, :3, :3], np.concatenate([g[:, :3, None], H[:, :3, 3:]], 2))
         pull = g[:, 3:] - (H[:, 3:, :3] @ back[..., :1])[..., 0]
         stiff = H[:, 3:, 3:] - H[:, 3:, :3] @ back[..., 1:]
-        change, covariance = _agreed(pull[used], stiff[used], theta - expected, precision)
+        change, covariance = _agreed(pull[used], stiff[used], theta - expected, precision, alike)
         step = -(back[..., 0] + back[..., 1:] @ change)
         step[:, 0] = step[:, 0].clip(-3 * patches.pixel, 3 * patches.pixel)
         local[which[used]] += step[used]
@@ -417,7 +419,7 @@ def mean_of(x: np.ndarray, weight: np.ndarray, first: np.ndarray) -> np.ndarray:
 
 
 def _agreed(
-    pull: np.ndarray, stiff: np.ndarray, off: np.ndarray, precision: np.ndarray
+    pull: np.ndarray, stiff: np.ndarray, off: np.ndarray, precision: np.ndarray, alike: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """The step (p,) on which patches agree with each other and with what was known, and the covariance after it.
 
@@ -428,6 +430,7 @@ def _agreed(
         pull: (n, p) gradients of the patches.
         stiff: (n, p, p) their curvatures.
         off: (p,) from what was expected, which was known with ``precision`` (p, p).
+        alike: patches that count as one.
     """
     weight, inverse = np.ones(len(pull)), np.linalg.pinv(stiff, rcond=1e-9, hermitian=True)
     for _ in range(5):
@@ -444,6 +447,6 @@ def _agreed(
     best = (vector[:, felt] / value[felt]) @ vector[:, felt].T
     left = weight[:, None] * (pull - stiff @ (best @ g))
     spread = np.trace(best @ (left.T @ left)) / max(rank, 1)
-    inflation = max(1.0, spread * len(pull) / max(len(pull) - rank, 1))
+    inflation = alike * max(1.0, spread * len(pull) / max(len(pull) - rank, 1))
     step = -np.linalg.solve(H / inflation + precision, g / inflation + precision @ off)
-    return step, np.linalg.inv(H / (inflation * COUNT_AS_ONE) + precision)
+    return step, np.linalg.inv(H / inflation + precision)
