@@ -34,6 +34,8 @@ DEEP, TILTED = 1.2, 0.3
 """How far patches lie off the drawn surface, in pixels, and how much they tilt, as a slope: standard deviations."""
 NEAR = 0.015
 """Extents from the drawn surface within which a patch is on it."""
+COUNT_AS_ONE = 20.0
+"""As many patches count as one in standard deviations."""
 STEP = 1e-3
 """For derivatives of poses, radians and extents."""
 
@@ -50,8 +52,8 @@ class PatchConfig:
     """Photographs of each state that are matched, about."""
     rounds: int = 5
     """Of Gauss-Newton."""
-    alike: float = 20.0
-    """Patches side by side err alike, as a highlight lies on all of them: so many count as one."""
+    alike: float = 3.0
+    """Patches side by side err alike, as a highlight lies on all of them: so many count as one beside what is known."""
 
 
 @dataclass(frozen=True)
@@ -447,6 +449,6 @@ def _agreed(
     best = (vector[:, felt] / value[felt]) @ vector[:, felt].T
     left = weight[:, None] * (pull - stiff @ (best @ g))
     spread = np.trace(best @ (left.T @ left)) / max(rank, 1)
-    inflation = alike * max(1.0, spread * len(pull) / max(len(pull) - rank, 1))
-    step = -np.linalg.solve(H / inflation + precision, g / inflation + precision @ off)
-    return step, np.linalg.inv(H / inflation + precision)
+    inflation = max(1.0, spread * len(pull) / max(len(pull) - rank, 1))
+    step = -np.linalg.solve(H / (inflation * alike) + precision, g / (inflation * alike) + precision @ off)
+    return step, np.linalg.inv(H / (inflation * COUNT_AS_ONE) + precision)
