@@ -198,10 +198,8 @@ def _filled(grid: DistanceGrid, surface: np.ndarray, config: MeshConfig, *, boun
     side.
     """
     hull = _hull_distance(surface, grid.lower, grid.distance.shape, grid.voxel)
-    unseen, reach = grid.weight == 0, _reach(surface, config)
-    wall = min(reach, _thickness(grid, surface, reach))
-    solid = _solid_unseen(grid.distance, unseen, hull <= 1, surface, grid.lower, grid.voxel, reach, wall)
-    distance = np.where(unseen, np.where(solid, -1, 1), grid.distance).astype(np.float32)
+    solid = _solid_unseen(grid, hull <= 1, surface, _reach(surface, config))
+    distance = np.where(grid.weight == 0, np.where(solid, -1, 1), grid.distance).astype(np.float32)
     if bounded:
         within = np.maximum(distance, np.clip(hull * (grid.voxel / grid.truncation), -1, 1))
         if (within < 0).sum() > MOST * (distance < 0).sum():
@@ -215,30 +213,23 @@ def _reach(surface: np.ndarray, config: MeshConfig) -> float:
 
 
 def _thickness(grid: DistanceGrid, surface: np.ndarray, reach: float) -> float:
-    """How thick the walls of a part are where they were seen from both sides; ``reach`` where that is too rare."""
+    """How thick walls of a part are where both sides were seen: at most ``reach``, and that where it is too rare."""
     known = wall_thickness(grid, 2 * reach)
-    return float(np.median(known)) if len(known) > TWO_SIDED * len(surface) else reach
+    return min(float(np.median(known)), reach) if len(known) > TWO_SIDED * len(surface) else reach
 
 
-def _solid_unseen(
-    distance: np.ndarray,
-    unseen: np.ndarray,
-    hull: np.ndarray,
-    surface: np.ndarray,
-    lower: np.ndarray,
-    voxel: float,
-    reach: float,
-    wall: float,
-) -> np.ndarray:
+def _solid_unseen(grid: DistanceGrid, hull: np.ndarray, surface: np.ndarray, reach: float) -> np.ndarray:
     """Which unseen voxels belong to the part: those of its walls, and pockets that these close.
 
     Walls stand on the surface (n, 3) and, as what it stands on is rarely photographed, on its convex ``hull``. What
     lies deeper than ``reach`` behind them is a pocket. It is empty where it lies open towards space that was seen to be
-    empty, and then it is as large as walls of the thickness ``wall`` leave it.
+    empty, and then it is as large as walls as thick as those seen from both sides leave it.
     """
+    voxel, distance, unseen = grid.voxel, grid.distance, grid.weight == 0
     inside = unseen & hull
     index = np.argwhere(inside)
-    away, _ = KDTree(surface).query(lower + voxel * index, distance_upper_bound=reach, workers=torch.get_num_threads())
+    places, threads = grid.lower + voxel * index, torch.get_num_threads()
+    away, _ = KDTree(surface).query(places, distance_upper_bound=reach, workers=threads)
 
     def behind(thickness: float) -> np.ndarray:
         """The unseen voxels that lie deeper than walls of that thickness."""
@@ -260,7 +251,8 @@ def _solid_unseen(
     open_, closed = borders(seen & (distance > 0)), borders((inside & ~deep) | (~unseen & (distance <= 0)))
     hollow = open_ > HOLLOW * (open_ + closed)
     hollow[0] = False
-    empty, more = hollow[pocket], max(round((reach - wall) / voxel), 0)
+    wall, empty = _thickness(grid, surface, reach), hollow[pocket]
+    more = round((reach - wall) / voxel)
     if more and empty.any():
         empty = np.asarray(ndimage.binary_dilation(empty, iterations=more, mask=behind(wall)), bool)
     return inside & ~empty
