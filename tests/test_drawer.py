@@ -108,6 +108,21 @@ def test_a_drawer_seen_open_alone_ends_where_it_would_be_when_shut() -> None:
     assert solid_at(found, 0, 0.55, 0.1) and not solid_at(found, 0, 0.58, 0.1)
 
 
+def test_a_drawer_that_was_always_ajar_ends_where_it_would_be_when_shut() -> None:
+    x, z = (a.ravel() for a in np.meshgrid(np.linspace(-0.29, 0.29, 40), np.linspace(-0.01, 0.21, 20)))
+    rim = (np.abs(x) > 0.275) | (z > 0.203)
+    frame = np.stack([x, 0 * x + 0.12, z], 1)[rim]
+    depth = np.linspace(0.12, 0.9, 40)
+    sides = np.stack([np.repeat([-0.29, 0.29], 40), np.tile(depth, 2), np.full(80, 0.1)], 1)
+
+    def ends_at(base: np.ndarray, y: float) -> bool:
+        found = drawn_out(grid(), tray(0.15), base, [np.eye(4), OUT], (0.02, 0.04))
+        return any(solid_at(found, 0, y + d, 0.1) for d in (-0.02, -0.01, 0)) and not solid_at(found, 0, y + 0.02, 0.1)
+
+    assert ends_at(np.concatenate([BACK, frame, sides]), 0.76) and ends_at(np.concatenate([BACK, frame]), 0.76)
+    assert ends_at(np.concatenate([BACK, sides]), 0.86)  # Without a frame, nothing tells.
+
+
 @pytest.mark.parametrize("why", ["turns", "stands still", "is full", "nothing is behind"])
 def test_what_is_no_drawer_stays_as_it_is(why: str) -> None:
     way = {"turns": revolute([0, 0, 1], [0.3, 0, 0], 0.5), "stands still": np.eye(4)}.get(why, OUT)
@@ -147,6 +162,18 @@ def test_a_bottom_that_was_always_hidden_is_there_and_an_open_top_stays_open() -
     for y in (0.1, 0.3, 0.6):
         assert solid_at(found, 0, y, -0.01) and solid_at(found, 0.25, y, 0.1)
         assert not solid_at(found, 0, y, 0.1) and not solid_at(found, 0, y, 0.19) and not solid_at(found, 0, y, -0.05)
+
+
+def test_what_nobody_saw_of_a_drawer_is_as_thick_as_its_walls() -> None:
+    part = grid()
+    x = np.abs(part.lower[0] + 0.01 * np.arange(71))[:, None, None]
+    beside = np.broadcast_to(x > 0.245, part.distance.shape).copy()
+    beside[:, :8] = False  # The front was seen.
+    guess = beside & (x < 0.3)  # As thick as walls that nobody measured.
+    part = replace(part, weight=np.where(beside, 0, part.weight), distance=np.where(guess, -1, part.distance))
+    found = drawn_out(part, tray(0.15), BACK, [np.eye(4), OUT], (0.05, 0.04))
+    for y in (0.06, 0.12, 0.3, 0.6):
+        assert solid_at(found, 0.25, y, 0.1) and not solid_at(found, 0.29, y, 0.1)
 
 
 def test_a_wall_with_a_ragged_end_goes_on_from_where_it_was_whole() -> None:

@@ -16,7 +16,7 @@ from hingesplat.labelling import Whereabouts, hidden
 from hingesplat.screw import axes_across, slide_of
 from hingesplat.se3 import moved
 from hingesplat.surface import Labels, Surface, components
-from hingesplat.tsdf import DistanceGrid
+from hingesplat.tsdf import DistanceGrid, usual_thickness
 
 SEEN = 0.1
 """Share of what its walls enclose that must have been seen, for it to be hollow."""
@@ -32,6 +32,8 @@ SPAN, RISE = 0.6, 0.3
 """Shares of an outline's width and height that a back spans; what spans less is in the drawer, or a strip of floor."""
 STRAY = 0.02
 """Share of a surface that may lie deeper than its last cross-section."""
+FRAME = 2
+"""Times the points of other slices around its opening that a slice with the frame of a drawer has."""
 MARGIN = 3
 """Empty cells around a cross-section."""
 NARROW = 0.08
@@ -122,35 +124,35 @@ def drawn_out(
         T_base_part: (4, 4) places on its way.
         walls: how thick the part's and the base's walls count where nobody saw them, scene units.
     """
-    own, wall = walls
+    reach, gap = walls
     axis = slide_of(T_base_part)
     if axis is None:
         return part
-    ways, front = np.array([T[:3, 3] for T in T_base_part]), _largest(surface, 2 * own)
+    ways, front = np.array([T[:3, 3] for T in T_base_part]), _largest(surface, 2 * reach)
     for inwards in (axis, -axis):
         across = axes_across(inwards)
-        if len(front) < FEWEST or _narrowest(front @ across.T) < own:
+        if len(front) < FEWEST or _narrowest(front @ across.T) < reach:
             continue
         covered = _outline(front @ across.T)  # A drawer's box is behind its front.
         box = surface[covered.find_simplex(surface @ across.T) >= 0]
-        section = _section(part, box, inwards, covered, own) if len(box) else None
+        section = _section(part, box, inwards, covered, reach) if len(box) else None
         if section is None:
             continue
-        start, outline = section.start, section.outline
-        farthest = float((ways @ inwards).max())
-        behind = base[base @ inwards > start + farthest + wall]
-        behind = behind[_inner(outline, behind @ across.T)] @ inwards
-        if len(behind) < FEWEST:
+        closed = base - float((ways @ inwards).max()) * inwards
+        deep = closed[closed @ inwards > section.start + gap]
+        deep = deep[_inner(section.outline, deep @ across.T)]
+        if len(deep) < FEWEST:
             continue
-        end = float(np.median(behind)) - farthest - wall
-        inside = box[(box @ inwards > start) & _inner(outline, box @ across.T)]
-        for back in np.arange(end, start, -own):  # Its own back, if that was seen.
-            face = inside[np.abs(inside @ inwards - back) < own / 2]
-            if len(face) >= FEWEST and _spans(face @ across.T, outline.points):
-                end = float(np.median(face @ inwards)) + own
+        stop = float(np.median(deep @ inwards))
+        end = stop - gap - _ajar(section, closed, inwards, stop, covered)
+        inside = box[(box @ inwards > section.start) & _inner(section.outline, box @ across.T)]
+        for back in np.arange(end, section.start, -reach):  # Its own back, if that was seen.
+            face = inside[np.abs(inside @ inwards - back) < reach / 2]
+            if len(face) >= FEWEST and _spans(face @ across.T, section.outline.points):
+                end = float(np.median(face @ inwards)) + section.wall
                 break
-        if end > start + 2 * own:
-            part = _extruded(part, section, inwards, end, covered, own)
+        if end > section.start + 2 * reach:
+            part = _extruded(part, section, inwards, end, covered)
     return part
 
 
@@ -186,12 +188,22 @@ def _inner(outline: Delaunay, flat: np.ndarray) -> np.ndarray:
     return outline.find_simplex(middle + (flat - middle) / INNER) >= 0
 
 
+def _seen_on_the_way(cells: np.ndarray, seen: np.ndarray, to: np.ndarray) -> np.ndarray:
+    """(n, 2) the first of the cells that were ``seen`` on the straight way from each of ``cells`` (n, 2) ``to`` (2,)
+    one; just the last where none was."""
+    ways = np.rint(np.linspace(cells, np.broadcast_to(to, cells.shape), max(seen.shape), axis=1)).astype(int)
+    first = seen[tuple(ways.T)].argmax(0)
+    return ways[np.arange(len(cells)), first]
+
+
 @dataclass(frozen=True)
 class _Section:
     """What a drawer looks like across its way, and how deep it was seen whole."""
 
     front: float
     """Where its front ends, along the way inwards."""
+    wall: float
+    """How thick its walls are, scene units."""
     start: float
     """Where its walls were last whole."""
     outline: Delaunay
@@ -208,13 +220,13 @@ class _Section:
 
 
 def _section(
-    part: DistanceGrid, surface: np.ndarray, inwards: np.ndarray, covered: Delaunay, wall: float
+    part: DistanceGrid, surface: np.ndarray, inwards: np.ndarray, covered: Delaunay, reach: float
 ) -> _Section | None:
     """The median of all slices behind the front; None if it is narrow or full, or too little was seen of its hollow.
 
     Args:
         surface: (n, 3) points that were seen of it, behind and in its front, whose outline across is ``covered``.
-        wall: how thick its walls count; what is narrower than three is no section.
+        reach: how thick its walls count where that was not seen; what is narrower than three walls is no section.
     """
     across, lower = axes_across(inwards), covered.points.min(0) - MARGIN * part.voxel
     shape = np.ceil(np.ptp(covered.points, axis=0) / part.voxel).astype(int) + 1 + 2 * MARGIN
@@ -227,12 +239,16 @@ def _section(
     known = ndimage.map_coordinates((part.weight > 0).astype(np.uint8), index, order=0).reshape(len(depths), -1) > 0
     # Of what nobody saw, walls are known well enough; what only closes pockets is not.
     guess = np.nonzero(~known & (distance < 0))
-    known[guess] = np.isfinite(KDTree(surface).query(places[guess], distance_upper_bound=wall)[0])
-    solid = known & (distance < 0)
-    full = solid[:, behind_front].mean(1) > FULL
+    away = np.full(distance.shape, np.inf)
+    away[guess] = KDTree(surface).query(places[guess], distance_upper_bound=reach)[0]
+    full = ((known | np.isfinite(away)) & (distance < 0))[:, behind_front].mean(1) > FULL
     behind = slice(int(np.flatnonzero(full).max(initial=-1)) + 1, None)
     if not len(depths[behind]):
         return None
+    front = float(depths[behind][0])
+    wall = usual_thickness(_behind(part, inwards, front), len(surface), reach)
+    known |= away < wall
+    solid = known & (distance < 0)
     seen = known[behind].sum(0)
     often = seen > OFTEN * max(int(seen.max(initial=0)), 1)
     profile = np.ones(len(cells))
@@ -246,16 +262,37 @@ def _section(
     within = outline.find_simplex(cells) >= 0
     if walls[within].mean() > FULL or often[within & ~walls].mean() < SEEN:
         return None
-    # Its rim is wall, too, where nobody saw that it is not: a bottom that was always hidden.
-    core = ndimage.binary_erosion(within.reshape(shape), iterations=2)
-    profile[within & ~core.ravel() & ~often] = -1
+    # Its rim is wall, too, unless one was seen farther in: a bottom that was always hidden.
+    rim = within & ~ndimage.binary_erosion(within.reshape(shape), iterations=2).ravel() & ~often
+    cells_of_it = np.argwhere(rim.reshape(shape))
+    first = _seen_on_the_way(cells_of_it, often.reshape(shape), np.argwhere(within.reshape(shape)).mean(0))
+    profile[np.flatnonzero(rim)[~walls.reshape(shape)[tuple(first.T)]]] = -1
     shown = solid[behind][:, walls].mean(1)
     start = depths[behind][np.flatnonzero(shown > WHOLE * shown.max()).max()]
-    return _Section(float(depths[behind][0]), float(start), outline, lower, part.voxel, profile.reshape(shape))
+    return _Section(front, wall, float(start), outline, lower, part.voxel, profile.reshape(shape))
+
+
+def _ajar(section: _Section, base: np.ndarray, inwards: np.ndarray, stop: float, covered: Delaunay) -> float:
+    """How far a drawer that is as deep in its cabinet as it ever was is from being shut; 0 if nothing tells.
+
+    A drawer may have been open in every state. Its front would meet a frame around the opening, and of what that front
+    covers and its box does not, most is there.
+
+    Args:
+        base: (n, 3) points of the cabinet.
+        stop: where its back is, along the way inwards.
+    """
+    flat, depth = base @ axes_across(inwards).T, base @ inwards - section.front
+    met = depth[(covered.find_simplex(flat) >= 0) & (section.outline.find_simplex(flat) < 0)]
+    slice_, most = section.wall, (stop - section.front) / 2
+    count, edges = np.histogram(met, np.arange(-2 * slice_, max(most, slice_), slice_))
+    if count.max() < max(FEWEST, FRAME * np.median(count)):
+        return 0.0
+    return max(float(edges[count.argmax()] + slice_ / 2), 0.0)
 
 
 def _extruded(
-    part: DistanceGrid, section: _Section, inwards: np.ndarray, end: float, covered: Delaunay, wall: float
+    part: DistanceGrid, section: _Section, inwards: np.ndarray, end: float, covered: Delaunay
 ) -> DistanceGrid:
     """The part with its walls as they are in its section from where they were last whole to a back before ``end``."""
     across = axes_across(inwards)
@@ -266,14 +303,20 @@ def _extruded(
     along, flat = places[rows] @ inwards, places[rows] @ across.T
     walls = section.at(flat)
     walls[_inner(section.outline, flat) & (walls < 0)] = 1  # What lies in a drawer does not go on.
-    back = (np.abs(along - (end - wall / 2)) - wall / 2) / part.truncation
+    back = (np.abs(along - (end - section.wall / 2)) - section.wall / 2) / part.truncation
     back[section.outline.find_simplex(flat) < 0] = 1
     guess = np.where(along < end, np.minimum(walls, back), (along - end) / part.truncation)
     distance, unseen = grid.distance.ravel().copy(), grid.weight.ravel()[rows] == 0
     # Beside the ragged end of a wall, what was behind it was seen for it.
-    new = np.where(along > section.start, unseen | (guess < 0), unseen & (guess < distance[rows]))
+    new = unseen | ((along > section.start) & (guess < 0))
     distance[rows[new]] = np.clip(guess[new], -1, 1)
     return replace(grid, distance=distance.reshape(grid.distance.shape))
+
+
+def _behind(grid: DistanceGrid, inwards: np.ndarray, depth: float) -> DistanceGrid:
+    """The same grid as if only what lies deeper had been seen."""
+    places = grid.lower[:, None, None, None] + grid.voxel * np.indices(grid.distance.shape)
+    return replace(grid, weight=np.where(np.tensordot(inwards, places, 1) > depth, grid.weight, 0))
 
 
 def _longer(grid: DistanceGrid, far: np.ndarray) -> DistanceGrid:

@@ -27,7 +27,7 @@ from hingesplat.render import rasterize
 from hingesplat.screw import slide_of
 from hingesplat.se3 import wxyz_to_matrix
 from hingesplat.stereo import DepthMap, contradicted, cubes
-from hingesplat.tsdf import DepthView, DistanceGrid, distance_to, fuse_depth, tangent_planes, wall_thickness
+from hingesplat.tsdf import DepthView, DistanceGrid, distance_to, fuse_depth, tangent_planes, usual_thickness
 
 log = logging.getLogger(__name__)
 
@@ -35,8 +35,6 @@ MOST = 0.5
 """Share of a part that must lie within the convex hull of what was seen of it for that to be its bound."""
 HOLLOW = 0.2
 """An unseen pocket is empty where more than this share of what borders on it was seen to be."""
-TWO_SIDED = 0.01
-"""Places where a wall was seen from both sides, of those of the surface, from which on they tell how thick it is."""
 DENSE, WIDER = 0.15, 1.2
 """Share of the cells that pixels fall into that three of them must see, and the factor by which cells grow for that. Of
 parts of two objects it was 0.19 to 0.62, but 0.007 of a small drawer."""
@@ -155,7 +153,8 @@ def _solids(
     """Distances of every part that was seen, no two parts in one place.
 
     What was seen stays before what was guessed, and the base gives way to its movers: a mover's guess ends where the
-    base was seen, and all that a mover passes through on its way is empty.
+    base was seen, and all that a mover passes through on its way is empty. The box of a drawer goes on all the same:
+    what was seen where it must be is more likely its own.
     """
     grids, surfaces = {}, {}
     for i in views:
@@ -170,11 +169,11 @@ def _solids(
     for i in grids.keys() - {0}:
         T_base_mover = [p.get(i, np.eye(4)) for p in poses]
         mover = _filled(grids[i], surfaces[i], config, bounded=slide_of(T_base_mover) is None)
-        walls = _reach(surfaces[i], config), _reach(surfaces[0], config)
-        mover = drawn_out(mover, surfaces[i], surfaces[0], T_base_mover, walls)
         taken = -distance_to(mover, known, [np.linalg.inv(T) for T in T_base_mover]) / mover.truncation
         guess = np.maximum(mover.distance, np.minimum(taken, 1))
-        grids[i] = mover = replace(mover, distance=np.where(mover.weight > 0, mover.distance, guess))
+        mover = replace(mover, distance=np.where(mover.weight > 0, mover.distance, guess))
+        walls = _reach(surfaces[i], config), _reach(surfaces[0], config)
+        grids[i] = mover = drawn_out(mover, surfaces[i], surfaces[0], T_base_mover, walls)
         room = np.minimum(room, distance_to(base, mover, T_base_mover))
     base = _filled(base, surfaces[0], config, bounded=True)
     taken = (config.clearance * base.voxel - room) / base.truncation
@@ -212,12 +211,6 @@ def _reach(surface: np.ndarray, config: MeshConfig) -> float:
     return config.reach * float(np.ptp(surface, axis=0).max())
 
 
-def _thickness(grid: DistanceGrid, surface: np.ndarray, reach: float) -> float:
-    """How thick walls of a part are where both sides were seen: at most ``reach``, and that where it is too rare."""
-    known = wall_thickness(grid, 2 * reach)
-    return min(float(np.median(known)), reach) if len(known) > TWO_SIDED * len(surface) else reach
-
-
 def _solid_unseen(grid: DistanceGrid, hull: np.ndarray, surface: np.ndarray, reach: float) -> np.ndarray:
     """Which unseen voxels belong to the part: those of its walls, and pockets that these close.
 
@@ -251,7 +244,7 @@ def _solid_unseen(grid: DistanceGrid, hull: np.ndarray, surface: np.ndarray, rea
     open_, closed = borders(seen & (distance > 0)), borders((inside & ~deep) | (~unseen & (distance <= 0)))
     hollow = open_ > HOLLOW * (open_ + closed)
     hollow[0] = False
-    wall, empty = _thickness(grid, surface, reach), hollow[pocket]
+    wall, empty = usual_thickness(grid, len(surface), reach), hollow[pocket]
     more = round((reach - wall) / voxel)
     if more and empty.any():
         empty = np.asarray(ndimage.binary_dilation(empty, iterations=more, mask=behind(wall)), bool)

@@ -16,6 +16,8 @@ from hingesplat.threads import parallel
 WALL, DEEP = np.float32(2.0), np.float32(0.001)
 """How much lying just behind the part's own surface says for being inside, and lying farther behind, beside the 1 of a
 view that sees through. It takes several good views to hollow a wall, and few to see into what lies behind it."""
+TWO_SIDED = 0.01
+"""Places where a wall was seen from both sides, of those of the surface, from which on they tell how thick it is."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +105,15 @@ def wall_thickness(grid: DistanceGrid, most: float) -> np.ndarray:
     the line and the wall's normal. Lines that meet a side at less than 45° do not count.
     """
     return np.array(_walls(grid.distance, grid.weight, most / grid.voxel), float) * grid.voxel
+
+
+def usual_thickness(grid: DistanceGrid, points: int, reach: float) -> float:
+    """How thick walls of a part are where both sides were seen, scene units: the median, at most ``reach``.
+
+    Just that where such places are rare beside the ``points`` of its surface.
+    """
+    known = wall_thickness(grid, 2 * reach)
+    return min(float(np.median(known)), reach) if len(known) > TWO_SIDED * points else reach
 
 
 def tangent_planes(camera: Camera, depth: np.ndarray, jump: float) -> np.ndarray:
