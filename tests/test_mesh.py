@@ -13,6 +13,7 @@ from hingesplat.camera import Camera
 from hingesplat.gaussians import SH_C0, Gaussians, concatenate
 from hingesplat.mesh import (
     MeshConfig,
+    _solid_unseen,
     _surface_points,
     close_surface,
     hull_mesh,
@@ -21,7 +22,7 @@ from hingesplat.mesh import (
 from hingesplat.metrics.surface import penetration
 from hingesplat.se3 import matrix_to_wxyz
 from hingesplat.stereo import DepthMap
-from hingesplat.tsdf import DepthView, distance_to, fuse_depth, tangent_planes, wall_thickness
+from hingesplat.tsdf import DepthView, DistanceGrid, distance_to, fuse_depth, tangent_planes, wall_thickness
 from hingesplat.twin import Joint, Part, Twin
 
 
@@ -244,6 +245,23 @@ def test_what_is_unseen_in_the_depth_of_an_open_carcass_is_empty(wall: float, re
     scene = box_gaussians((0.8, 0.8, 0.8), (0, 0, 0), 0)
     mesh = mesh_parts(scene, [(cameras, {})], MeshConfig(resolution=resolution, image_size=96), maps=maps)[0]
     assert mesh.is_watertight and mesh.volume == pytest.approx(carcass.volume, rel=0.1)
+
+
+@pytest.mark.parametrize("open_", [False, True])
+def test_specks_seen_to_be_free_do_not_hollow_a_block_but_a_way_in_does(open_: bool):
+    n, depth = 48, np.full((48, 48, 48), 48)
+    for axis in range(3):
+        at = np.arange(n).reshape([-1 if a == axis else 1 for a in range(3)])
+        depth = np.minimum(depth, np.minimum(at, n - 1 - at))  # Voxels from the border.
+    distance, weight = np.where(depth < 4, 1, -1).astype(np.float32), (depth < 6).astype(np.float32)
+    free = np.zeros_like(weight, bool)
+    free[9:-9:3, 9:-9:3, 9:-9:3] = True
+    if open_:
+        free[8:-8, 8:-8, :20] = True
+    distance[free], weight[free] = 1, 1
+    surface = np.argwhere(depth == 4).astype(float)
+    inside = _solid_unseen(DistanceGrid(np.zeros(3), 1.0, 2.5, distance, weight), depth >= 4, surface, 3.0)
+    assert inside[24, 24, 32] != open_
 
 
 def test_no_part_is_where_another_has_been():
