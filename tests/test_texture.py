@@ -13,7 +13,7 @@ from hingesplat.se3 import moved
 from hingesplat.search import Motion
 from hingesplat.segment import SegmentConfig, _Case
 from hingesplat.surface import Surface
-from hingesplat.texture import TextureConfig, carried, fitted, photographs_of
+from hingesplat.texture import TextureConfig, carried, fitted, photographs_of, unless_still
 from hingesplat.visibility import Sight
 from scenes import ANGLE, AXIS, FORWARD, PIVOT, SLIDE, scene
 
@@ -104,6 +104,29 @@ def test_what_one_state_shows_differently_from_place_to_place_is_gloss() -> None
     first, second = photographs("revolute", part=0)
     others = [photographs("revolute", part=0, phases=(0, 0.7 * i + 0.5))[1][i] for i in range(len(second))]
     assert len(likeness((first, others))) < 0.2 * len(likeness((first, second)))
+
+
+@pytest.mark.parametrize(
+    ("here", "there", "goes_back"),
+    [
+        ([0.95] * 8, [0.3] * 8, True),
+        ([0.95] * 8 + [0.5] * 9, [0.3] * 8, False),  # Most of its texture is not where it was.
+        ([0.95] * 8, [0.95] * 9, False),  # More of it has gone along.
+        ([0.95] * 4, [], False),  # Too little texture to tell.
+    ],
+)
+def test_what_a_part_gained_stays_if_its_texture_is_where_it_was(
+    here: list[float], there: list[float], goes_back: bool
+) -> None:
+    T, owned, more = place("prismatic")(STILL)[1], np.array([0, 0, 0, 1, 2]), np.array([0, 1, 1, 1, 2])
+
+    def likeness_of(way: np.ndarray, mine: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        gained = np.any(mine)
+        assert not gained or [m.tolist() for m in mine] == [[False, True, True, False, False]] * 2
+        return np.array(here if (way == np.eye(4)).all() else there) if gained else np.zeros(0)
+
+    for labels in unless_still([T, T], (owned, owned), (more, more), likeness_of):
+        np.testing.assert_array_equal(labels, owned if goes_back else more)
 
 
 def test_photographs_are_few_and_small_enough() -> None:

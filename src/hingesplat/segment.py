@@ -56,6 +56,7 @@ from hingesplat.texture import (
     likeness,
     photographs_of,
     told_apart,
+    unless_still,
     vouched_for,
 )
 from hingesplat.training import evenly
@@ -217,7 +218,7 @@ def segment(
     if not any(carrier_of(m, chosen) is not None for m in chosen):
         chosen = case.corrected(chosen, photographs)
         chosen = case.heard_again(chosen, found, photographs, seed)
-    chosen, owned = _labelled(chosen, surfaces, evidence.extent, config, parts)
+    chosen, owned = _labelled(chosen, surfaces, photographs, evidence.extent, config, parts, seed)
     costs = _seed_costs(evidence, judges, chosen) if chosen else np.ones((1, 1))
     unexplained = float((costs.min(1) >= config.hypotheses.explained_cost).mean())
     labels = tuple(spread_labels(gaussians[s].means.numpy(), surfaces[s], owned[s]) for s in (0, 1))
@@ -441,9 +442,11 @@ class _Case:
 def _labelled(
     motions: list[Motion],
     surfaces: tuple[Surface, Surface],
+    photographs: Sequence[Sequence[Photograph]],
     extent: float,
     config: SegmentConfig,
     parts: int | None,
+    seed: int,
 ) -> tuple[list[Motion], Labels]:
     """The parts that these motions make, each one piece, and labels of all points of both states."""
     problem = Labelling.of(surfaces, extent)
@@ -467,7 +470,11 @@ def _labelled(
     owned = follow_fronts(owned, surfaces, extent, told)
     owned = behind_fronts(transforms, owned, surfaces, extent, told)
     owned = insides(transforms, owned, surfaces, extent)
-    owned = bordered(transforms, owned, problem, told)
+
+    def texture(T: np.ndarray, mine: Pair) -> np.ndarray:
+        return likeness(compared(surfaces, photographs, T, mine, extent, config.texture, seed))
+
+    owned = unless_still(transforms, owned, bordered(transforms, owned, problem, told), texture)
     return seen_to_move(motions, owned, surfaces, config.min_part_seeds)
 
 

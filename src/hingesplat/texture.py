@@ -22,7 +22,7 @@ from hingesplat.render import render
 from hingesplat.screw import axes_across
 from hingesplat.se3 import from_Rt, moved, rotvec_to_matrix
 from hingesplat.search import Motion
-from hingesplat.surface import Pair, Surface
+from hingesplat.surface import Labels, Pair, Surface
 from hingesplat.training import evenly, training_view
 
 WIDTH, ROUNDS = 9, 4
@@ -130,6 +130,30 @@ def vouched_for(
         if all((likeness(j, mine) > AGREED).sum() < OTHERWISE * len(own) for j in (None, *kept)):
             return vouched_for(choices, {**prices, k: price}, heeded, likeness, price, parts)
     return prices
+
+
+def unless_still(
+    T_1_0: Sequence[np.ndarray], owned: Labels, more: Labels, likeness: Callable[[np.ndarray, Pair], np.ndarray]
+) -> Labels:
+    """Labels after points of the base went to parts, but for those of a part whose texture is, mostly, where it was.
+
+    A speckled case looks much the same all along its slide, and the knife's thumb piece took half of it along.
+
+    Args:
+        T_1_0: (4, 4) motion of each part from state 0 to state 1.
+        owned: label of each point before, 0 for the base.
+        more: after.
+        likeness: correlations (m,) of the texture of such points, (n,) bool of each state, moved so (4, 4).
+    """
+    labels = (more[0].copy(), more[1].copy())
+    for k, T in enumerate(T_1_0, 1):
+        gained = (owned[0] == 0) & (more[0] == k), (owned[1] == 0) & (more[1] == k)
+        here, there = likeness(np.eye(4), gained), likeness(T, gained)
+        still = int((here > GOES_ALONG).sum())
+        if still >= max(ENOUGH, len(here) / 2) and still > (there > GOES_ALONG).sum():
+            for label, mine in zip(labels, gained, strict=True):
+                label[mine] = 0
+    return labels
 
 
 def _goes_along(likeness: np.ndarray) -> bool:
@@ -287,5 +311,6 @@ __all__ = [
     "likeness",
     "photographs_of",
     "told_apart",
+    "unless_still",
     "vouched_for",
 ]
