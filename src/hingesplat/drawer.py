@@ -196,6 +196,14 @@ def _seen_on_the_way(cells: np.ndarray, seen: np.ndarray, to: np.ndarray) -> np.
     return ways[np.arange(len(cells)), first]
 
 
+def _distance_to_cells(cells: np.ndarray) -> np.ndarray:
+    """Distance to the border of some cells, (…) bool, in cells; negative in them, inf if there are none."""
+    if not cells.any():
+        return np.full(cells.shape, np.inf)
+    outside, inside = ndimage.distance_transform_edt(~cells), ndimage.distance_transform_edt(cells)
+    return np.where(cells, 0.5 - np.asarray(inside), np.asarray(outside) - 0.5)
+
+
 @dataclass(frozen=True)
 class _Section:
     """What a drawer looks like across its way, and how deep it was seen whole."""
@@ -263,13 +271,14 @@ def _section(
     if walls[within].mean() > FULL or often[within & ~walls].mean() < SEEN:
         return None
     # Its rim is wall, too, unless one was seen farther in: a bottom that was always hidden.
-    rim = within & ~ndimage.binary_erosion(within.reshape(shape), iterations=2).ravel() & ~often
-    cells_of_it = np.argwhere(rim.reshape(shape))
-    first = _seen_on_the_way(cells_of_it, often.reshape(shape), np.argwhere(within.reshape(shape)).mean(0))
-    profile[np.flatnonzero(rim)[~walls.reshape(shape)[tuple(first.T)]]] = -1
+    seen_, inner = often.reshape(shape), within.reshape(shape)
+    rim = inner & ~ndimage.binary_erosion(inner, iterations=max(round(wall / part.voxel), 2)) & ~seen_
+    first = _seen_on_the_way(np.argwhere(rim), seen_, np.argwhere(inner).mean(0))
+    rim[rim] = ~walls.reshape(shape)[tuple(first.T)]
+    profile = np.minimum(profile.reshape(shape), _distance_to_cells(rim) * (part.voxel / part.truncation))
     shown = solid[behind][:, walls].mean(1)
     start = depths[behind][np.flatnonzero(shown > WHOLE * shown.max()).max()]
-    return _Section(front, wall, float(start), outline, lower, part.voxel, profile.reshape(shape))
+    return _Section(front, wall, float(start), outline, lower, part.voxel, np.clip(profile, -1, 1))
 
 
 def _ajar(section: _Section, base: np.ndarray, inwards: np.ndarray, stop: float, covered: Delaunay) -> float:
