@@ -274,7 +274,7 @@ def _section(
     seen_, inner = often.reshape(shape), within.reshape(shape)
     rim = inner & ~ndimage.binary_erosion(inner, iterations=max(round(wall / part.voxel), 2)) & ~seen_
     first = _seen_on_the_way(np.argwhere(rim), seen_, np.argwhere(inner).mean(0))
-    rim[rim] = ~walls.reshape(shape)[tuple(first.T)]
+    rim[rim] = profile.reshape(shape)[tuple(first.T)] >= 0
     profile = np.minimum(profile.reshape(shape), _distance_to_cells(rim) * (part.voxel / part.truncation))
     shown = solid[behind][:, walls].mean(1)
     start = depths[behind][np.flatnonzero(shown > WHOLE * shown.max()).max()]
