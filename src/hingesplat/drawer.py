@@ -188,22 +188,6 @@ def _inner(outline: Delaunay, flat: np.ndarray) -> np.ndarray:
     return outline.find_simplex(middle + (flat - middle) / INNER) >= 0
 
 
-def _seen_on_the_way(cells: np.ndarray, seen: np.ndarray, to: np.ndarray) -> np.ndarray:
-    """(n, 2) the first of the cells that were ``seen`` on the straight way from each of ``cells`` (n, 2) ``to`` (2,)
-    one; just the last where none was."""
-    ways = np.rint(np.linspace(cells, np.broadcast_to(to, cells.shape), max(seen.shape), axis=1)).astype(int)
-    first = seen[tuple(ways.T)].argmax(0)
-    return ways[np.arange(len(cells)), first]
-
-
-def _distance_to_cells(cells: np.ndarray) -> np.ndarray:
-    """Distance to the border of some cells, (…) bool, in cells; negative in them, inf if there are none."""
-    if not cells.any():
-        return np.full(cells.shape, np.inf)
-    outside, inside = ndimage.distance_transform_edt(~cells), ndimage.distance_transform_edt(cells)
-    return np.where(cells, 0.5 - np.asarray(inside), np.asarray(outside) - 0.5)
-
-
 @dataclass(frozen=True)
 class _Section:
     """What a drawer looks like across its way, and how deep it was seen whole."""
@@ -270,15 +254,31 @@ def _section(
     within = outline.find_simplex(cells) >= 0
     if walls[within].mean() > FULL or often[within & ~walls].mean() < SEEN:
         return None
-    # Its rim is wall, too, unless one was seen farther in: a bottom that was always hidden.
-    seen_, inner = often.reshape(shape), within.reshape(shape)
-    rim = inner & ~ndimage.binary_erosion(inner, iterations=max(round(wall / part.voxel), 2)) & ~seen_
-    first = _seen_on_the_way(np.argwhere(rim), seen_, np.argwhere(inner).mean(0))
-    rim[rim] = profile.reshape(shape)[tuple(first.T)] >= 0
-    profile = np.minimum(profile.reshape(shape), _distance_to_cells(rim) * (part.voxel / part.truncation))
     shown = solid[behind][:, walls].mean(1)
     start = depths[behind][np.flatnonzero(shown > WHOLE * shown.max()).max()]
-    return _Section(front, wall, float(start), outline, lower, part.voxel, np.clip(profile, -1, 1))
+    rim = _rim(profile.reshape(shape), often.reshape(shape), within.reshape(shape), round(wall / part.voxel))
+    profile = np.minimum(profile.reshape(shape), np.clip(rim * (part.voxel / part.truncation), -1, 1))
+    return _Section(front, wall, float(start), outline, lower, part.voxel, profile)
+
+
+def _rim(profile: np.ndarray, seen: np.ndarray, within: np.ndarray, thick: int) -> np.ndarray:
+    """Distance in cells to a wall along the outline where none was seen farther in: a bottom that was always hidden.
+
+    Args:
+        profile: (cells, cells) distance to the walls that were seen.
+        seen: (cells, cells) bool: what is known of them.
+        within: (cells, cells) bool: the outline.
+        thick: of the wall, cells.
+    """
+    rim = within & ~np.asarray(ndimage.binary_erosion(within, iterations=max(thick, 2)), bool) & ~seen
+    cells, middle = np.argwhere(rim), np.argwhere(within).mean(0)
+    ways = np.linspace(cells, np.broadcast_to(middle, cells.shape), max(seen.shape), axis=1).round().astype(int)
+    first = ways[np.arange(len(cells)), seen[tuple(ways.T)].argmax(0)]  # That was seen on the way to the middle.
+    rim[rim] = profile[tuple(first.T)] >= 0
+    if not rim.any():
+        return np.full(rim.shape, np.inf)
+    outside, inside = map(np.asarray, (ndimage.distance_transform_edt(~rim), ndimage.distance_transform_edt(rim)))
+    return np.where(rim, 0.5 - inside, outside - 0.5)
 
 
 def _ajar(section: _Section, base: np.ndarray, inwards: np.ndarray, stop: float, covered: Delaunay) -> float:
