@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hingesplat.drawer import behind_fronts, drawn_out, insides
+from hingesplat.drawer import behind_fronts, insides
+from hingesplat.drawer_box import drawn_out
 from hingesplat.screw import prismatic, revolute
 from hingesplat.surface import Surface
 from hingesplat.tsdf import DistanceGrid

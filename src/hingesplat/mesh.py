@@ -21,7 +21,7 @@ from skimage.measure import marching_cubes
 from trimesh.visual import ColorVisuals
 
 from hingesplat.camera import Camera
-from hingesplat.drawer import drawn_out
+from hingesplat.drawer_box import drawn_out
 from hingesplat.gaussians import SH_C0, Gaussians, posed
 from hingesplat.render import rasterize
 from hingesplat.screw import slide_of
