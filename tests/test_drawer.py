@@ -151,7 +151,8 @@ def test_a_flat_part_has_no_section(way: list[float]) -> None:
     assert drawn_out(part, plate, BACK, [np.eye(4), prismatic(way, 0.3)], (0.02, 0.04)) is part
 
 
-def test_a_bottom_that_was_always_hidden_is_there_and_an_open_top_stays_open() -> None:
+@pytest.mark.parametrize("something_in_it", [False, True])
+def test_a_bottom_that_was_always_hidden_is_there_and_an_open_top_stays_open(something_in_it: bool) -> None:
     part = grid()
     z = part.lower[2] + 0.01 * np.arange(36)
     below = np.broadcast_to((z < 0.06) & (z > -0.06), part.distance.shape).copy()
@@ -159,6 +160,8 @@ def test_a_bottom_that_was_always_hidden_is_there_and_an_open_top_stays_open() -
     x = np.abs(part.lower[0] + 0.01 * np.arange(71))
     below[x > 0.23] = False  # So were the sides.
     part = replace(part, weight=np.where(below, 0, part.weight), distance=np.where(below, 1, part.distance))
+    if something_in_it:
+        part.distance[15:56, 8:, 13:16] = -1  # At z = 0.06 to 0.08.
     found = drawn_out(part, tray(0.15), BACK, [np.eye(4), OUT], (0.02, 0.04))
     for y in (0.1, 0.3, 0.6):
         assert solid_at(found, 0, y, -0.01) and solid_at(found, 0.25, y, 0.1)

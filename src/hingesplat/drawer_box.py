@@ -165,16 +165,17 @@ def _section(
         return None
     shown = solid[behind][:, walls].mean(1)
     start = depths[behind][np.flatnonzero(shown > WHOLE * shown.max()).max()]
-    rim = _rim(profile.reshape(shape), often.reshape(shape), within.reshape(shape), round(wall / part.voxel))
+    stands = (walls & ~_inner(outline, cells)).reshape(shape)
+    rim = _rim(stands, often.reshape(shape), within.reshape(shape), round(wall / part.voxel))
     profile = np.minimum(profile.reshape(shape), np.clip(rim * (part.voxel / part.truncation), -1, 1))
     return _Section(front, wall, float(start), outline, lower, part.voxel, profile)
 
 
-def _rim(profile: np.ndarray, seen: np.ndarray, within: np.ndarray, thick: int) -> np.ndarray:
+def _rim(walls: np.ndarray, seen: np.ndarray, within: np.ndarray, thick: int) -> np.ndarray:
     """Distance in cells to a wall along the outline where none was seen farther in: a bottom that was always hidden.
 
     Args:
-        profile: (cells, cells) distance to the walls that were seen.
+        walls: (cells, cells) bool: those that were seen and go on.
         seen: (cells, cells) bool: what is known of them.
         within: (cells, cells) bool: the outline.
         thick: of the wall, cells.
@@ -183,7 +184,7 @@ def _rim(profile: np.ndarray, seen: np.ndarray, within: np.ndarray, thick: int) 
     cells, middle = np.argwhere(rim), np.argwhere(within).mean(0)
     ways = np.linspace(cells, np.broadcast_to(middle, cells.shape), max(seen.shape), axis=1).round().astype(int)
     first = ways[np.arange(len(cells)), seen[tuple(ways.T)].argmax(0)]  # That was seen on the way to the middle.
-    rim[rim] = profile[tuple(first.T)] >= 0
+    rim[rim] = np.logical_not(walls[tuple(first.T)])
     if not rim.any():
         return np.full(rim.shape, np.inf)
     outside, inside = map(np.asarray, (ndimage.distance_transform_edt(~rim), ndimage.distance_transform_edt(rim)))
