@@ -21,7 +21,7 @@ from hingesplat.patches import CONTRAST, FEWEST, NEAR, Patches, Photograph, adju
 from hingesplat.render import render
 from hingesplat.screw import axes_across
 from hingesplat.se3 import from_Rt, moved, rotvec_to_matrix
-from hingesplat.search import Motion
+from hingesplat.search import BASE, Motion
 from hingesplat.surface import Labels, Pair, Surface
 from hingesplat.training import evenly, training_view
 
@@ -148,9 +148,9 @@ def unless_still(
     labels = (more[0].copy(), more[1].copy())
     for k, T in enumerate(T_1_0, 1):
         gained = (owned[0] == 0) & (more[0] == k), (owned[1] == 0) & (more[1] == k)
-        here, there = likeness(np.eye(4), gained), likeness(T, gained)
+        here = likeness(BASE, gained)
         still = int((here > GOES_ALONG).sum())
-        if still >= max(ENOUGH, len(here) / 2) and still > (there > GOES_ALONG).sum():
+        if still >= max(ENOUGH, len(here) / 2) and still > (likeness(T, gained) > GOES_ALONG).sum():
             for label, mine in zip(labels, gained, strict=True):
                 label[mine] = 0
     return labels
