@@ -295,6 +295,17 @@ def test_help_imports_nothing_heavy() -> None:
     assert "reconstruct" in done.stdout and "demo" in done.stdout
 
 
+def test_a_run_does_without_the_compiler_of_torch() -> None:
+    code = (
+        "import sys, torch; from hingesplat import pipeline; from hingesplat.poses import Adam, pose_step\n"
+        "x = torch.zeros(1, requires_grad=True); x.grad = torch.ones(1)\n"
+        "with pipeline._repeatable('cpu'):\n    pose_step(Adam([x]), 0.1, 0.5)\n"
+        "heavy = {'torch._dynamo', 'torch._inductor', 'sklearn'} & set(sys.modules); print(heavy); sys.exit(len(heavy))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
 def test_public_names_come_when_asked_for() -> None:
     assert hingesplat.reconstruct is pipeline.reconstruct
     assert hingesplat.ReconstructConfig is ReconstructConfig

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from hingesplat.gaussians import Gaussians
-from hingesplat.optim import GaussianAdam, LearningRates, Moments, densify, morton_order
+from hingesplat.optim import Adam, GaussianAdam, LearningRates, Moments, densify, morton_order
 from hingesplat.se3 import matrix_to_wxyz, rotvec_to_matrix
 from scenes import box
 
@@ -114,6 +114,19 @@ def test_first_step_is_the_learning_rate_and_decays_over_the_run(g: torch.Genera
             expected = rate * (0.01 if name == "means" else 0.1) ** progress
             torch.testing.assert_close(moved, torch.full_like(moved, expected), rtol=2e-2, atol=2e-7)
         assert all(v.grad is None for v in optimiser.values.values())
+
+
+def test_a_few_tensors_step_at_rates_of_their_own() -> None:
+    values = [torch.zeros(3).requires_grad_(), torch.zeros((2, 2)).requires_grad_()]
+    adam = Adam(values)
+    for v in values:
+        v.grad = torch.full_like(v, 7.0)
+    adam.step(0.1, 0.2)
+    for v, rate in zip(values, (0.1, 0.2), strict=True):
+        torch.testing.assert_close(v.detach(), torch.full_like(v, -rate), rtol=1e-5, atol=0)  # Adam's first step is the rate.
+        assert v.grad is None
+    adam.step(0.1, 0.2)  # Without gradients nothing happens.
+    assert values[0].detach().tolist() == pytest.approx([-0.1] * 3, rel=1e-5)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

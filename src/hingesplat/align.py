@@ -15,6 +15,7 @@ from torch import Tensor
 
 from hingesplat.capture import View
 from hingesplat.gaussians import Gaussians, concatenate
+from hingesplat.optim import Adam
 from hingesplat.poses import PoseDelta, errors_by_part, part_centres, pose_loss, pose_step
 from hingesplat.training import evenly, shown, shuffled, thinned, training_views
 
@@ -78,7 +79,7 @@ def align(
     start = torch.from_numpy(T_state_0).to(first.means)
     poses = PoseDelta(start, part_centres(first, parts), float((high - low).max()))
     training = training_views(views, (), device)
-    adam = torch.optim.Adam(poses.parameters, lr=config.rate)
+    adam = Adam(poses.parameters)
     photographs = shuffled(training, np.random.default_rng(seed))
     for step in range(config.steps):
         state, view = next(photographs)

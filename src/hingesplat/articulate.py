@@ -12,7 +12,7 @@ from hingesplat.capture import View
 from hingesplat.gaussians import Gaussians, posed
 from hingesplat.identity import Free, Identity, IdentityConfig, identity_of, parts_of_shifts
 from hingesplat.losses.part import soft_motion
-from hingesplat.optim import GaussianAdam, LearningRates
+from hingesplat.optim import Adam, GaussianAdam, LearningRates
 from hingesplat.physics import PhysicsConfig, RepelConfig, Repulsion, Targets, one_hot, physics_loss
 from hingesplat.poses import (
     PoseDelta,
@@ -96,7 +96,7 @@ def articulate(
     centres = part_centres(canonical, parts)
     first = config.frame == "first"
     poses = PoseDelta(torch.from_numpy(T_state_0).to(canonical.means), centres, extent, first_is_frame=first)
-    pose_adam = torch.optim.Adam(poses.parameters, lr=config.pose_rate)
+    pose_adam = Adam(poses.parameters)
     rate = config.rates.means * extent
     identity = identity_of(canonical, parts, fitted, config.identity, extent, rate, generator)
     targets = Targets(canonical, fitted, config.physics, extent, seed)

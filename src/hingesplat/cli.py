@@ -270,16 +270,11 @@ class Demo:
 
 
 def demo_config() -> "ReconstructConfig":
-    """The standard preset with fewer Gaussians, for the demo's 200 pixels, and longer over them."""
+    """The standard preset with fewer Gaussians a state, for the demo's 200 pixels."""
     from hingesplat.pipeline import ReconstructConfig
 
     config = ReconstructConfig()
-    return replace(
-        config,
-        fit=replace(config.fit, start_gaussians=3000, max_gaussians=8000),
-        articulate=replace(config.articulate, steps=1700, max_gaussians=16_000),
-        mesh=replace(config.mesh, views=32, image_size=200),
-    )
+    return replace(config, fit=replace(config.fit, start_gaussians=3000, max_gaussians=8000))
 
 
 @dataclass(frozen=True)

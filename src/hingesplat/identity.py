@@ -16,7 +16,7 @@ from hingesplat.gaussians import Gaussians
 from hingesplat.losses.part import nearest_neighbours, part_loss, part_probabilities
 from hingesplat.losses.velocity import fit_parts
 from hingesplat.matching import nearest, one_to_one
-from hingesplat.optim import GaussianAdam
+from hingesplat.optim import Adam, GaussianAdam
 from hingesplat.se3 import wxyz_to_matrix
 
 Extra = dict[str, tuple[Tensor, float]]
@@ -109,14 +109,13 @@ class Centres(Identity):
         self.centres = centres.requires_grad_()
         self.log_scales = radii.log()[:, None].repeat(1, 3).requires_grad_()
         self.quats = torch.tensor([1.0, 0, 0, 0]).to(g.means).repeat(parts, 1).requires_grad_()
-        rates = ((self.centres, 1e-3 * extent), (self.log_scales, 1e-2), (self.quats, 1e-3))
-        self.adam = torch.optim.Adam([{"params": [v], "lr": rate} for v, rate in rates])
+        self.adam = Adam((self.centres, self.log_scales, self.quats))
+        self.rates = 1e-3 * extent, 1e-2, 1e-3
         self.extra = {"residual": (g.means.new_zeros((len(g), parts)), config.rate)}
 
     def probabilities(self, optimiser: GaussianAdam, progress: float) -> Tensor | None:
         # The gradients of the step before: this is called once a step.
-        self.adam.step()
-        self.adam.zero_grad(set_to_none=True)
+        self.adam.step(*self.rates)
         if progress >= self.config.hard_from:
             return None
         away = optimiser.values["means"].detach()[:, None] - self.centres

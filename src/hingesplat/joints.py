@@ -13,7 +13,7 @@ from torch import Tensor
 from hingesplat.capture import View
 from hingesplat.chains import closest_joint, parents_of
 from hingesplat.gaussians import Gaussians
-from hingesplat.optim import GaussianAdam, LearningRates
+from hingesplat.optim import Adam, GaussianAdam, LearningRates
 from hingesplat.patches import PatchConfig, Photograph, adjust, patches_of
 from hingesplat.poses import (
     StateLossConfig,
@@ -210,7 +210,7 @@ def find_joints(
     poses = poses_of(kinds)
     extra = {"state_sh": (state_sh[1:].permute(1, 0, 2), config.rates.sh)}
     optimiser = GaussianAdam(gaussians, config.rates, extent, extra)
-    adam = torch.optim.Adam(poses.parameters, lr=config.rate)
+    adam = Adam(poses.parameters)
     photographs = shuffled(training, rng)
     tell = averaged(report, config.steps)
 

@@ -1,7 +1,7 @@
 """Adam over a changing set of Gaussians: densify, split, prune."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,6 +76,19 @@ def _adam(value, gradient, first, second, rate, shrink, t, threads):
         v = beta2 * second[i] + (one - beta2) * g * g
         first[i], second[i] = m, v
         value[i] -= rate * m / (np.sqrt(v) * shrink + epsilon)
+
+
+class Adam:
+    """Adam over a few tensors. Torch's own imports its compiler first, for over a second."""
+
+    def __init__(self, values: Sequence[Tensor]) -> None:
+        self.values = values
+        self.moments = [Moments(torch.zeros_like(v), torch.zeros_like(v)) for v in values]
+
+    def step(self, *rates: float) -> None:
+        """One update, with a step size each. Gradients are cleared."""
+        for value, moments, rate in zip(self.values, self.moments, rates, strict=True):
+            moments.step(value, rate)
 
 
 class GaussianAdam:

@@ -644,9 +644,10 @@ def _repeatable(device: str) -> Iterator[None]:
 
     On the CPU; gsplat's kernels add as they come.
     """
-    before = torch.are_deterministic_algorithms_enabled()
-    torch.use_deterministic_algorithms(device == "cpu")
+    before = torch.get_deterministic_debug_mode()
+    # Not use_deterministic_algorithms: that imports torch's compiler, for over a second.
+    torch.set_deterministic_debug_mode("error" if device == "cpu" else "default")
     try:
         yield
     finally:
-        torch.use_deterministic_algorithms(before)
+        torch.set_deterministic_debug_mode(before)

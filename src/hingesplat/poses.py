@@ -11,7 +11,7 @@ from torch import Tensor
 from hingesplat.camera import Camera
 from hingesplat.gaussians import Gaussians
 from hingesplat.losses.photometric import photometric
-from hingesplat.optim import GaussianAdam
+from hingesplat.optim import Adam, GaussianAdam
 from hingesplat.render import Rendering, place, rasterize
 from hingesplat.se3 import rotvec_to_matrix
 from hingesplat.training import TrainingView, shuffled, view_loss
@@ -115,7 +115,7 @@ def move_parts_alone(
         rate: Adam step; decays to 2 %.
         state_sh: (states, n, 3) colour offsets.
     """
-    adam = torch.optim.Adam(poses.parameters, lr=rate)
+    adam = Adam(poses.parameters)
     photographs = shuffled(training[1:], rng)
     for step in range(steps):
         before, view = next(photographs)
@@ -178,12 +178,9 @@ def errors_by_part(
     return np.stack(rows, 1)
 
 
-def pose_step(adam: torch.optim.Adam, rate: float, progress: float, end: float = 0.02) -> None:
+def pose_step(adam: Adam, rate: float, progress: float, end: float = 0.02) -> None:
     """One step of poses or joints; their rate decays to ``end`` of ``rate`` as ``progress`` goes from 0 to 1."""
-    for group in adam.param_groups:
-        group["lr"] = rate * end**progress
-    adam.step()
-    adam.zero_grad(set_to_none=True)
+    adam.step(*[rate * end**progress] * len(adam.values))
 
 
 def part_centres(g: Gaussians, parts: int) -> Tensor:

@@ -1,22 +1,28 @@
-"""Rigid transforms as 4×4 matrices and quaternions wxyz; thin names over roma, whose own order is xyzw."""
+"""Rigid transforms as 4×4 matrices and quaternions wxyz."""
+
+from collections.abc import Sequence
 
 import numpy as np
-import roma
 import torch
 from torch import Tensor
 
 
 def wxyz_to_matrix(quats: Tensor) -> Tensor:
     """Quaternions (..., 4) wxyz, of any non-zero length, to rotation matrices (..., 3, 3)."""
-    unit = torch.nn.functional.normalize(quats, dim=-1)
-    return roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(unit))
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return _stacked(rows)
 
 
 def matrix_to_wxyz(R: Tensor) -> Tensor:
     """Rotation matrices (..., 3, 3) to unit quaternions (..., 4) wxyz, the largest component positive.
 
-    4 q qᵀ is linear in R, and its row with the largest diagonal is the best q. roma's function branches on numbers,
-    for which a GPU would have to wait for the host.
+    4 q qᵀ is linear in R, and its row with the largest diagonal is the best q. Nothing branches on numbers, for which a
+    GPU would have to wait for the host.
     """
     a, b, c, d, e, f, g, h, i = R.flatten(-2).unbind(-1)
     rows = (
@@ -25,7 +31,7 @@ def matrix_to_wxyz(R: Tensor) -> Tensor:
         (c - g, b + d, 1 - a + e - i, f + h),
         (d - b, c + g, f + h, 1 - a - e + i),
     )
-    outer = torch.stack([torch.stack(row, -1) for row in rows], -2)
+    outer = _stacked(rows)
     best = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
     row = outer.gather(-2, best[..., None, None].expand(*best.shape, 1, 4))
     return torch.nn.functional.normalize(row[..., 0, :], dim=-1)
@@ -47,8 +53,16 @@ def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
 
 
 def rotvec_to_matrix(rotvec: Tensor) -> Tensor:
-    """Axis times angle (..., 3) in radians to rotation matrices (..., 3, 3); smooth at zero."""
-    return roma.rotvec_to_rotmat(rotvec)
+    """Axis times angle (..., 3) in radians to rotation matrices (..., 3, 3), by Rodrigues' formula; smooth at zero."""
+    squared = (rotvec * rotvec).sum(-1)
+    small = squared < 1e-6  # The series is exact to rounding there, and the quotients' gradients are not finite at 0.
+    angle = torch.where(small, 1.0, squared).sqrt()
+    sine = torch.where(small, 1 - squared / 6, angle.sin() / angle)[..., None, None]
+    half = torch.where(small, 1 - squared / 24, (angle / 2).sin() / (angle / 2))[..., None, None]
+    x, y, z = rotvec.unbind(-1)
+    zero = torch.zeros_like(x)
+    K = _stacked(((zero, -z, y), (z, zero, -x), (-y, x, zero)))
+    return torch.eye(3).to(rotvec) + sine * K + half * half / 2 * (K @ K)
 
 
 def from_Rt(R: Tensor, t: Tensor) -> Tensor:
@@ -78,3 +92,8 @@ def moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
 def apart(points: np.ndarray, T: np.ndarray, other: np.ndarray) -> float:
     """Mean distance between the places to which two transforms (4, 4) take points (n, 3)."""
     return float(np.linalg.norm(moved(points, T) - moved(points, other), axis=1).mean())
+
+
+def _stacked(rows: Sequence[Sequence[Tensor]]) -> Tensor:
+    """Entries (...) to matrices (..., rows, columns)."""
+    return torch.stack([torch.stack(tuple(row), -1) for row in rows], -2)

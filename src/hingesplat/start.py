@@ -10,7 +10,6 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
-from sklearn.cluster import SpectralClustering
 
 from hingesplat.gaussians import Gaussians
 from hingesplat.matching import one_to_one
@@ -53,6 +52,8 @@ def clusters(
     After ArtGS: Gaussians far from any of the other state have moved; pairs of a one-to-one match stand between the
     states, and each moved Gaussian takes the cluster of the nearest pair's end in its own state.
     """
+    from sklearn.cluster import SpectralClustering  # Takes most of a second, and few ask for it.
+
     points = [g.means.numpy() for g in gaussians]
     squared = [KDTree(points[1 - s]).query(points[s])[0] ** 2 for s in (0, 1)]
     moving = [d > config.static * max(d.max() for d in squared) for d in squared]
