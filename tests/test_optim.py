@@ -123,7 +123,9 @@ def test_a_few_tensors_step_at_rates_of_their_own() -> None:
         v.grad = torch.full_like(v, 7.0)
     adam.step(0.1, 0.2)
     for v, rate in zip(values, (0.1, 0.2), strict=True):
-        torch.testing.assert_close(v.detach(), torch.full_like(v, -rate), rtol=1e-5, atol=0)  # Adam's first step is the rate.
+        torch.testing.assert_close(
+            v.detach(), torch.full_like(v, -rate), rtol=1e-5, atol=0
+        )  # Adam's first step is the rate.
         assert v.grad is None
     adam.step(0.1, 0.2)  # Without gradients nothing happens.
     assert values[0].detach().tolist() == pytest.approx([-0.1] * 3, rel=1e-5)
