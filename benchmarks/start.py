@@ -67,7 +67,7 @@ def help_seconds() -> float:
     times = []
     for _ in range(REPEATS):
         start = time.perf_counter()
-        subprocess.run([sys.executable, "-m", "hingesplat.cli", "--help"], stdout=subprocess.DEVNULL, check=True)
+        subprocess.run([sys.executable, "-m", "hingesplat", "--help"], stdout=subprocess.DEVNULL, check=True)
         times.append(time.perf_counter() - start)
     return float(np.median(times))
 
@@ -78,7 +78,7 @@ def compilations() -> list[dict[str, float]]:
         environment = os.environ | {"NUMBA_CACHE_DIR": f"{folder}/cache"}
         capture, out = f"{folder}/capture", f"{folder}/run"
         made = ["synth", "cabinet", "--out", capture, "--size", "96", "--views", "24", "--test-views", "2", "--quiet"]
-        subprocess.run([sys.executable, "-m", "hingesplat.cli", *made], env=environment, check=True)
+        subprocess.run([sys.executable, "-m", "hingesplat", *made], env=environment, check=True)
         found = []
         for _ in range(2):
             command = [sys.executable, __file__, "--child", "reconstruct", capture, "--out", out, *SHORT]

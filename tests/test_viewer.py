@@ -241,7 +241,7 @@ def test_a_capture_that_is_gone_leaves_the_twin(run: Path, made: Path, tmp_path:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is another thing there")
 def test_the_command_serves_until_interrupted(run: Path) -> None:
-    command = [sys.executable, "-m", "hingesplat.cli", "view", str(run), "--port", "0"]
+    command = [sys.executable, "-m", "hingesplat", "view", str(run), "--port", "0"]
 
     def hear_ctrl_c() -> None:  # Shells start what runs in the background deaf to it.
         signal.signal(signal.SIGINT, signal.SIG_DFL)

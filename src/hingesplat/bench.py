@@ -247,7 +247,7 @@ def results(run: Path) -> Row:
 
 def call(*args: str) -> str | None:
     """Run one command of the program in a process of its own; its last words if it fails."""
-    command = [sys.executable, "-m", "hingesplat.cli", *args, "--quiet"]
+    command = [sys.executable, "-m", "hingesplat", *args, "--quiet"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     said = done.stderr.strip() or f"exit code {done.returncode}"
     return said.splitlines()[-1] if done.returncode else None

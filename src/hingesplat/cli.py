@@ -419,7 +419,3 @@ def use_all_cores() -> None:
         import torch
 
         torch.set_num_threads(os.cpu_count() or 1)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

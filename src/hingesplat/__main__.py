@@ -1,0 +1,7 @@
+"""``python -m hingesplat``."""
+
+import sys
+
+from hingesplat.cli import main
+
+sys.exit(main())
