@@ -1012,12 +1012,13 @@ def test_a_part_is_not_passed_on_from_one_to_another() -> None:
     first, second, apart = (
         plain(np.concatenate([BASE, *doors, inside])) for inside in (*insides, doors[0] + (0.2, 0, 0))
     )
-    np.testing.assert_array_equal(passed_on(lying_on((given, given), (first, second), 1.0)), [0, 0, 1])
+    np.testing.assert_array_equal(passed_on(lying_on((given, given), 3, (first, second), 1.0)), [0, 0, 1])
     for others in ((first, first), (first, apart)):  # A lever stays on its door, and may swing away from it.
-        np.testing.assert_array_equal(passed_on(lying_on((given, given), others, 1.0)), [0, 0, 0])
+        np.testing.assert_array_equal(passed_on(lying_on((given, given), 3, others, 1.0)), [0, 0, 0])
     # On one door in both states it rides.
-    np.testing.assert_array_equal(riding(lying_on((given, given), (first, first), 1.0))[2], 1)
-    np.testing.assert_array_equal(riding(lying_on((given, given), (first, second), 1.0))[2], 0)
+    np.testing.assert_array_equal(riding(lying_on((given, given), 3, (first, first), 1.0))[2], 1)
+    np.testing.assert_array_equal(riding(lying_on((given, given), 3, (first, second), 1.0))[2], 0)
+    assert lying_on((given, given), 4, (first, first), 1.0).shape == (2, 4, 4)  # A motion may own nothing.
 
 
 def test_what_is_left_without_points_in_one_state_is_no_part(monkeypatch) -> None:

@@ -206,12 +206,11 @@ def follow_fronts(owned: Labels, surfaces: tuple[Surface, Surface], extent: floa
     return labels
 
 
-def lying_on(owned: Labels, surfaces: tuple[Surface, Surface], extent: float) -> np.ndarray:
+def lying_on(owned: Labels, parts: int, surfaces: tuple[Surface, Surface], extent: float) -> np.ndarray:
     """(2, parts, parts) share of each part's points in each state that lie on another part.
 
     A point lies on what is nearest of what is not its own part's, and no farther than ``UNDER``.
     """
-    parts = max(int(o.max(initial=0)) for o in owned)
     share = np.zeros((2, parts, 1 + parts))
     for s in (0, 1):
         points = surfaces[s].points

@@ -452,7 +452,7 @@ def _labelled(
     problem = Labelling.of(surfaces, extent)
     while True:
         owned, met = problem.labels_and_meeting([m.T for m in motions])
-        share = lying_on(owned, surfaces, extent)
+        share = lying_on(owned, len(motions), surfaces, extent)
         own_joint = np.array([not m.by_texture and carrier_of(m, motions) is None for m in motions], float)
         doubts = MEETING - met, passed_on(share) - PASSED_ON, own_joint * riding(share) - RIDING
         doubt = np.max(doubts, axis=0)
