@@ -144,6 +144,17 @@ def test_a_wrong_soft_label_is_corrected() -> None:
     assert wrong_after < 0.7 * wrong_before
 
 
+def test_a_part_of_hardly_any_gaussians_dies() -> None:
+    made = scene("revolute", 48, 0.08)
+    part = made.gaussians.part.clone()
+    part[torch.nonzero(part == 0)[:2]] = 2
+    T = np.concatenate([made.T_state_0, made.T_state_0[:, 1:]], 1)
+    T[1, 2, :3, 3] += 0.3
+    found = articulate(made.gaussians.with_part(part), T, made.views, FEW, fitted=(made.gaussians, made.at(1)))
+    assert found.T_state_0.shape == (2, 2, 4, 4)
+    assert sorted(found.gaussians.part.unique().tolist()) == [0, 1]
+
+
 def test_same_seed_same_motion() -> None:
     made = scene("revolute", 48, 0.08)
     a, b, c = (run(made, FEW, seed=s)[0].T_state_0 for s in (0, 0, 1))

@@ -1,7 +1,7 @@
 """Joint optimisation of Gaussians, part identities and part motions on the photographs of all states (sections 3–5)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -147,9 +147,10 @@ def _result(
     if isinstance(identity, Free):
         part, T = parts_of_shifts(g.means, optimiser.values["shift"].detach().cpu(), T.shape[1], seed)
         g = g.with_part(part)
-    if config.identity.kind != "hard":
-        label, living = living_slots(g.means.numpy(), g.part.numpy(), T, extent, config.slots)
-        g, T = g.with_part(torch.from_numpy(label)), T[:, living]
+    # What the search has told apart stays apart, but of what was none hardly anything is left.
+    slots = config.slots if config.identity.kind != "hard" else replace(config.slots, same_motion=0.0)
+    label, living = living_slots(g.means.numpy(), g.part.numpy(), T, extent, slots)
+    g, T = g.with_part(torch.from_numpy(label)), T[:, living]
     g, T = (
         posed(g, dict(enumerate(T[0]))),
         T @ np.linalg.inv(T[:1]),
