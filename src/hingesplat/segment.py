@@ -83,7 +83,8 @@ STAYS = 0.8
 """Share of its price for which a motion stays that was chosen among all: what is worth just that would come and go."""
 MEETING, HANGING_MEETS = 0.7, 0.8
 """Share of a part's points that must meet its points of the other state, in one of the states: right ones had 0.76 and
-more, wrong ones 0.68 and less. Of one that hangs on another there is little else to go by: there it was 0.90 and 0.75."""
+more, wrong ones 0.68 and less. Of one that hangs on another there is little else to go by: there it was 0.90 and more,
+and 0.75 and less."""
 PASSED_ON, RIDING = 0.5, 0.6
 """Share of a part's points that lie on one part in state 0 and on another in state 1, or on the same in both, from
 which it is none."""
