@@ -231,7 +231,7 @@ def meeting(partners: Sequence[np.ndarray], owned: Labels) -> np.ndarray:
     """(motions,) share of each motion's points that meet one of its own, in that state where more of them do.
 
     Of a part that one state shows nearly whole or hardly at all, that is nearly all of what the one or the other shows:
-    in 120 parts 0.76 at least. What merely hides had 0.4 and less.
+    in 120 parts 0.76 at least. What merely hides had 0.4 and less, a shelf that slid up a fridge's door 0.68.
 
     Args:
         partners: as ``Labelling.partners`` gives them, of both states.
