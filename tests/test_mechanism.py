@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hingesplat.hypotheses import IMPOSSIBLE
 from hingesplat.mechanism import AWAY, SLANTED, oddity
 from hingesplat.search import Motion
 
@@ -12,8 +13,8 @@ DOOR = np.stack(np.meshgrid(np.linspace(0, 0.4, 21), [0.0], np.linspace(0, 0.6, 
 """A plate that looks along y, 0.4 wide from x = 0, of an object of extent 1."""
 
 
-def hinge(at: float) -> Motion:
-    return Motion("revolute", np.array([0.0, 0.0, 1.0]), np.array([at, 0.0, 0.0]), 1.0, 1.0)
+def hinge(at: float, by: float = 0.5) -> Motion:
+    return Motion("revolute", np.array([0.0, 0.0, 1.0]), np.array([at, 0.0, 0.0]), by, 1.0)
 
 
 def slide(direction: list[float], by: float = 0.3) -> Motion:
@@ -26,6 +27,12 @@ def test_a_hinge_is_at_what_it_turns(at: float, least: float, most: float) -> No
     assert least <= oddity(hinge(at), DOOR, DOOR, 1.0) <= most
 
 
+def test_a_hinge_turns_by_no_more_than_it_has_to() -> None:
+    """A round lever that was a third of a turn about itself farther would look the same."""
+    small, large, most = (oddity(hinge(0, by), DOOR, DOOR, 1.0) for by in (1.2, 2.2, np.pi))
+    assert small < 0.1 < 0.4 < large < 1 < most < IMPOSSIBLE
+
+
 def test_a_slide_goes_along_or_across_a_plate() -> None:
     """A sliding door, a drawer's front; and neither, but the less so the less it goes."""
     assert oddity(slide([1, 0, 0]), DOOR, DOOR, 1.0) < 1e-9
@@ -36,7 +43,8 @@ def test_a_slide_goes_along_or_across_a_plate() -> None:
 
 def test_nothing_is_odd_about_what_nobody_saw() -> None:
     """Without points, and without a plate, nothing speaks against a joint."""
-    assert oddity(hinge(9), DOOR[:0], DOOR[:0], 1.0) == oddity(slide([1, 1, 0]), DOOR, DOOR[:0], 1.0) == 0
+    assert oddity(hinge(9), DOOR[:0], DOOR[:0], 1.0) < 0.01
+    assert oddity(slide([1, 1, 0]), DOOR, DOOR[:0], 1.0) == 0
 
 
 def test_oddity_knows_no_units_and_no_direction() -> None:

@@ -1,7 +1,7 @@
-"""How odd a joint it would take: hinges are at what they turn, and slides go along or across a plate.
+"""How odd a joint it would take: hinges are at what they turn, and not by much; slides go along or across a plate.
 
 Of two doors or drawers that look alike, one open in each state, photographs allow that the one went to where the other
-is. But no hinge would turn it so, and no rail lead there.
+is. But no hinge would turn it so, and no rail lead there. And a round lever might have turned about itself on its way.
 """
 
 import numpy as np
@@ -15,6 +15,8 @@ AWAY = 0.15
 show them, had 0.13 at most, those of doors taken for each other 0.46."""
 NEAREST = 0.05
 """Share of the points that may be nearer to a hinge line than what counts."""
+AROUND = 2.6
+"""Radians of a turn that make it as odd again: a lever's own was 1.2, and 2.2 with half a turn about itself."""
 SLANTED = 0.08
 """Extents that a slide goes slantwise to the largest plate that do: right ones had 0.05 at most, as seeds show plates,
 a drawer taken for another 0.12."""
@@ -32,7 +34,8 @@ def oddity(motion: Motion, points: Float[np.ndarray, "n 3"], plate: Float[np.nda
         extent: of the object, scene units.
     """
     if motion.kind == "revolute":
-        return (off_hinge(motion, points) / (AWAY * extent)) ** STEEP if len(points) else 0.0
+        away = off_hinge(motion, points) / (AWAY * extent) if len(points) else 0.0
+        return away**STEEP + (abs(motion.value) / AROUND) ** STEEP
     return (slantwise(motion, plate) / (SLANTED * extent)) ** STEEP if len(plate) else 0.0
 
 
