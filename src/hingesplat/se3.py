@@ -62,7 +62,7 @@ def rotvec_to_matrix(rotvec: Tensor) -> Tensor:
     x, y, z = rotvec.unbind(-1)
     zero = torch.zeros_like(x)
     K = _stacked(((zero, -z, y), (z, zero, -x), (-y, x, zero)))
-    return torch.eye(3).to(rotvec) + sine * K + half * half / 2 * (K @ K)
+    return torch.eye(3, dtype=rotvec.dtype, device=rotvec.device) + sine * K + half * half / 2 * (K @ K)
 
 
 def from_Rt(R: Tensor, t: Tensor) -> Tensor:
