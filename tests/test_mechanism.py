@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hingesplat.hypotheses import IMPOSSIBLE
-from hingesplat.mechanism import AWAY, SLANTED, oddity
+from hingesplat.mechanism import AROUND, AWAY, SLANTED, oddity
 from hingesplat.search import Motion
 
 DOOR = np.stack(np.meshgrid(np.linspace(0, 0.4, 21), [0.0], np.linspace(0, 0.6, 31)), -1).reshape(-1, 3)
@@ -43,8 +43,8 @@ def test_a_slide_goes_along_or_across_a_plate() -> None:
 
 def test_nothing_is_odd_about_what_nobody_saw() -> None:
     """Without points, and without a plate, nothing speaks against a joint."""
-    assert oddity(hinge(9), DOOR[:0], DOOR[:0], 1.0) < 0.01
-    assert oddity(slide([1, 1, 0]), DOOR, DOOR[:0], 1.0) == 0
+    assert oddity(hinge(9, 0), DOOR[:0], DOOR[:0], 1.0) == oddity(slide([1, 1, 0]), DOOR, DOOR[:0], 1.0) == 0
+    assert oddity(hinge(9), DOOR[:0], DOOR[:0], 1.0) == pytest.approx((0.5 / AROUND) ** 4)
 
 
 def test_oddity_knows_no_units_and_no_direction() -> None:

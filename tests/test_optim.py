@@ -123,9 +123,8 @@ def test_a_few_tensors_step_at_rates_of_their_own() -> None:
         v.grad = torch.full_like(v, 7.0)
     adam.step(0.1, 0.2)
     for v, rate in zip(values, (0.1, 0.2), strict=True):
-        torch.testing.assert_close(
-            v.detach(), torch.full_like(v, -rate), rtol=1e-5, atol=0
-        )  # Adam's first step is the rate.
+        # Adam's first step is the rate.
+        torch.testing.assert_close(v.detach(), torch.full_like(v, -rate), rtol=1e-5, atol=0)
         assert v.grad is None
     adam.step(0.1, 0.2)  # Without gradients nothing happens.
     assert values[0].detach().tolist() == pytest.approx([-0.1] * 3, rel=1e-5)
@@ -138,7 +137,7 @@ def test_a_step_is_torchs_own(g: torch.Generator, dtype: torch.dtype, threads: i
     ours = torch.randn((301, 3), generator=g, dtype=dtype).requires_grad_()
     theirs = ours.detach().clone().requires_grad_()
     adam = torch.optim.Adam([theirs], lr=0.03, eps=1e-15)
-    moments = Moments(torch.zeros_like(ours.detach()), torch.zeros_like(ours.detach()))
+    moments = Moments.of(ours.detach())
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:

@@ -45,6 +45,11 @@ class Moments:
     second: Tensor
     steps: int = 0
 
+    @staticmethod
+    def of(value: Tensor) -> "Moments":
+        """Of a tensor that has made no step."""
+        return Moments(torch.zeros_like(value), torch.zeros_like(value))
+
     def step(self, value: Tensor, rate: float) -> None:
         """Move ``value`` against its gradient, and clear that; without a gradient nothing happens."""
         gradient = value.grad
@@ -83,7 +88,7 @@ class Adam:
 
     def __init__(self, values: Sequence[Tensor]) -> None:
         self.values = values
-        self.moments = [Moments(torch.zeros_like(v), torch.zeros_like(v)) for v in values]
+        self.moments = [Moments.of(v) for v in values]
 
     def step(self, *rates: float) -> None:
         """One update, with a step size each. Gradients are cleared."""
@@ -114,7 +119,7 @@ class GaussianAdam:
 
     def _set(self, values: Mapping[str, Tensor], moments: Mapping[str, Moments]) -> None:
         self.values = {name: v.contiguous().requires_grad_() for name, v in values.items()}
-        fresh = {name: Moments(torch.zeros_like(v), torch.zeros_like(v)) for name, v in self.values.items()}
+        fresh = {name: Moments.of(v) for name, v in self.values.items()}
         self.moments = fresh | dict(moments)
 
     def __len__(self) -> int:

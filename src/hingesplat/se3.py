@@ -1,7 +1,5 @@
 """Rigid transforms as 4×4 matrices and quaternions wxyz."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -94,6 +92,6 @@ def apart(points: np.ndarray, T: np.ndarray, other: np.ndarray) -> float:
     return float(np.linalg.norm(moved(points, T) - moved(points, other), axis=1).mean())
 
 
-def _stacked(rows: Sequence[Sequence[Tensor]]) -> Tensor:
+def _stacked(rows: tuple[tuple[Tensor, ...], ...]) -> Tensor:
     """Entries (...) to matrices (..., rows, columns)."""
-    return torch.stack([torch.stack(tuple(row), -1) for row in rows], -2)
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
