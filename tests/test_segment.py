@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from hingesplat.capture import View
+from hingesplat.exchange import changed_places
 from hingesplat.gaussians import Gaussians, concatenate, posed
 from hingesplat.hypotheses import (
     PATCH,
@@ -74,7 +75,7 @@ from scenes import (
     box,
     cameras_around,
     nearest,
-    one_thread,  # noqa: F401
+    one_thread,  # noqa: F401,
     photograph,
     scene,
 )
@@ -1185,3 +1186,37 @@ def test_states_between_are_not_searched_again_where_all_is_known(monkeypatch) -
     found, other, T_state_0 = segment_states([made.gaussians, half, made.at(1)], views, QUICK)
     assert len(searched) == 1 and other == 2 and len(found.motions) == 1
     np.testing.assert_allclose(T_state_0[1, 1, :3, 3], FORWARD * SLIDE / 2, atol=0.015)
+
+
+def drawer(x: float, out: float) -> Gaussians:
+    """A plain front at y = −0.3 − ``out``, and the open box behind it."""
+    parts = [box((x - 0.22, -0.33, -0.2), (x + 0.22, -0.3, 0.2), 0.024, 0)]
+    parts += [box((x + a, -0.3, -0.18), (x + b, 0.25, 0.1), 0.024, 0) for a, b in ((-0.2, -0.18), (0.18, 0.2))]
+    parts += [box((x - 0.2, -0.3, -0.18), (x + 0.2, 0.25, -0.16), 0.024, 0)]
+    return posed(concatenate(parts), {0: prismatic(FORWARD, out)})
+
+
+def test_two_plain_drawers_are_not_one_that_changed_places() -> None:
+    """One motion meets all of both boxes and explains more; but each of two slides lays a front on one that is shut."""
+    walls = [box((-0.5, 0.3, -0.25), (0.5, 0.33, 0.25), 0.024, 0)]
+    walls += [box((-0.5, -0.3, z), (0.5, 0.33, z + 0.03), 0.024, 0) for z in (-0.25, 0.22)]
+    walls += [box((x, -0.3, -0.25), (x + 0.03, 0.33, 0.25), 0.024, 0) for x in (-0.5, -0.015, 0.47)]
+    states = [concatenate([*walls, drawer(-0.25, a), drawer(0.25, b)]) for a, b in ((0.35, 0.0), (0.0, 0.4))]
+    states = [replace(g, sh=0 * g.sh) for g in states]
+    cameras = [c for c in cameras_around(40, 96) if c.centre[2] > 0.3 and c.centre[1] < 0.8]
+    views = tuple([photograph(g, c) for c in cameras] for g in states)
+    low, high, surfaces = survey((states[0], states[1]), (views[0], views[1]), ((), ()), CONFIG)
+    extent = float((high - low).max())
+    shut, opened = (Motion("prismatic", FORWARD, np.zeros(3), value, 1.0) for value in (-0.35, 0.4))
+    aside = np.array([0.5, 0, 0]) + 0.05 * FORWARD
+    swap = Motion("prismatic", aside / np.linalg.norm(aside), np.zeros(3), float(np.linalg.norm(aside)), 1.0)
+    motions = [shut, opened, swap]
+    choices = Choices(Labelling.of(surfaces, extent), [m.T for m in motions])
+
+    def exchanged(kept: set[int]) -> list[int]:
+        taken = np.isin(np.arange(3), list(kept))
+        return [k for k in sorted(kept) if changed_places(choices, motions, kept, k, taken, extent)]
+
+    alone = choices.gains(frozenset())
+    assert alone[2] > alone[0] + choices.gains(frozenset({0}))[1]
+    assert exchanged({2}) == [2] and exchanged({0, 1, 2}) == [2] and exchanged({0, 1}) == []

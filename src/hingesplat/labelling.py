@@ -3,7 +3,7 @@
 A point's cost under a motion is what the other state's photographs say of the place where the motion takes it.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass
@@ -36,6 +36,8 @@ NOBODY = 0.3
 agrees (1)."""
 UNMET = 0.5
 """What a point counts that a promising motion takes where the other state shows none."""
+MAY, KNOWN_AGAIN = 0.45, 0.3
+"""Costs below which a point may follow a motion, be it out of sight, and below which it is recognised there."""
 AT_ONCE = 400_000
 """Places that photographs are asked about in one go."""
 ADDED, EXCHANGED, PAIRED, SECOND = 10, 6, 8, 2
@@ -331,6 +333,22 @@ class Choices:
                 others = own[:, [column for column in columns if column != k + 1]]
                 better[k] += float((others.min(1) - own[:, k + 1]).sum())
         return better
+
+    def stand_ins(self, kept: Collection[int], k: int) -> tuple[np.ndarray, np.ndarray]:
+        """How well every motion would do with what motion ``k`` of this set owns: on the way there, and on that back.
+
+        Returns:
+            (2, motions) share of those points of each state that may as well follow it, be it out of sight, and number
+            of the other state's points, met by none of the set, on which it lays some of them.
+        """
+        labels, may, found = self._solved(frozenset(kept))[0], [], []
+        for s, (mine, theirs) in enumerate((labels, labels[::-1])):
+            own, partners = mine == k + 1, self._partners[1 - s]
+            alone = (theirs != k + 1) & (partners[np.arange(len(theirs)), theirs] < 0)
+            there = partners[alone, 1:]
+            found.append(((there >= 0) & own[there] & (self._costs[1 - s][alone, 1:] < KNOWN_AGAIN)).sum(0))
+            may.append((self._costs[s][own, 1:] < MAY).sum(0) / max(own.sum(), 1))
+        return np.stack(may), np.stack(found)
 
     def labels(self, kept: Sequence[int]) -> Labels:
         """Labels of both states' points: 0 stays, i + 1 is to move by ``kept[i]``."""

@@ -19,6 +19,7 @@ from scipy.spatial import KDTree
 from hingesplat.borders import bordered
 from hingesplat.capture import View
 from hingesplat.drawer import behind_fronts, insides
+from hingesplat.exchange import changed_places
 from hingesplat.gaussians import Gaussians
 from hingesplat.hypotheses import (
     Evidence,
@@ -287,6 +288,9 @@ class _Case:
             choices, motions = choices.with_more([m.T for m in rivals]), [*motions, *rivals]
             usual = np.concatenate([usual, self._prices(rivals)])
             told = told_apart(choices, verdict, usual, self.parts)
+            while exchanges := self._exchanges(choices, motions, told):
+                usual[np.any(list(exchanges.values()), axis=0)] = np.inf
+                told = told_apart(choices, verdict, usual, self.parts)
             if all(p <= usual[k] for k, p in told.items()):
                 break
             kept = frozenset(told)
@@ -333,6 +337,17 @@ class _Case:
 
         return texture
 
+    def _exchanges(self, choices: Choices, motions: Sequence[Motion], told: Collection[int]) -> dict[int, np.ndarray]:
+        """Those told that are rather two drawers, each with (motions,) which others are like it."""
+        kept, extent = sorted(told), self.evidence.extent
+        first, _ = choices.labels(kept)
+        like = {}
+        for i, k in enumerate(kept, 1):
+            own, T = self.problem.surfaces[0].points[first == i], motions[k].T
+            like[k] = np.array([m is motions[k] or alike(own, m.T, T, extent) for m in motions])
+        known = np.any(list(like.values()), axis=0)
+        return {k: like[k] for k in kept if changed_places(choices, motions, kept, k, known, extent)}
+
     def settled(self, candidates: list[Motion], prices: list[float]) -> list[Motion]:
         """Those of the candidates that there are, refined on what they own."""
         owners: list[Pair] = []
@@ -373,15 +388,17 @@ class _Case:
         motions = [*chosen, *others]
         ways = [m.T for m in motions]
         usual = self._prices(motions)
-        texture = self._texture_under(ways, photographs, seed)
+        texture, among = self._texture_under(ways, photographs, seed), Choices(self.problem, ways)
 
         def worth(k: int, gain: float, _: Collection[int], mine: Pair) -> bool:
             asked = sum(min(int(m.sum()), self.config.texture.patches) for m in mine)
             along = int((likeness(texture(k, mine)) > GOES_ALONG).sum())
-            return gain > usual[k] * (1 - DISCOUNT * along / max(asked, 1))
+            if gain <= usual[k] * (1 - DISCOUNT * along / max(asked, 1)):
+                return False
+            return k not in self._exchanges(among, motions, [*kept, k])
 
         prices = vouched_for(
-            Choices(self.problem, ways),
+            among,
             dict.fromkeys(kept, price),
             worth,
             lambda *asked: likeness(texture(*asked)),
