@@ -724,6 +724,9 @@ def test_a_part_meets_itself_and_what_merely_hides_does_not(turned: Turned) -> N
     # What one state hides of a part has no partner; what it shows has.
     few = np.where(np.arange(len(part[0])) % 5, 0, part[0])
     assert meeting(problem.partners([TURN.T]), (few, part[1]))[0] > 0.8
+    # But a state that shows a handful of it says nothing: these would be found anywhere.
+    handful = np.where(np.arange(len(part[0])) % 40, 0, part[0])
+    assert meeting(problem.partners([TURN.T]), (handful, part[1]))[0] < 0.3
     assert meeting(problem.partners([TURN.T]), (0 * part[0], 0 * part[1]))[0] == 0
     assert meeting(problem.partners([]), (0 * part[0], 0 * part[1])).shape == (0,)
 

@@ -7,7 +7,7 @@ import pytest
 
 from hingesplat.gaussians import Gaussians, concatenate
 from hingesplat.stereo import DepthMap, fused, measured
-from hingesplat.visibility import COLOUR, FREE, HIDDEN, SURFACE, Sight, ask, look
+from hingesplat.visibility import COLOUR, FREE, HIDDEN, SURFACE, Sight, ask, look, sides
 from scenes import box, cameras_around, look_at, off_boards, open_box, photograph, sheet, texture
 
 SIZE = 96
@@ -81,6 +81,28 @@ def test_the_right_colour_differs_little_and_a_wrong_one_much(sight: Sight) -> N
     wrong = ask(CENTRES, 1 - texture(CENTRES, 1), sight)[:, COLOUR]
     assert right.max() < 0.15
     assert (wrong > 2 * right).all()
+
+
+def test_a_point_shows_the_side_from_which_it_is_seen_whose_colour_counts(sight: Sight) -> None:
+    """Whichever way its normal points. A door's inside has not the colour that cameras in front of the door see."""
+    outward = np.sign(CENTRES) * (CENTRES != 0)
+    for normals in (outward, -outward):
+        facing = sides(CENTRES, normals, sight)
+        assert ((facing * outward).sum(1) > 0.9).all()
+    wrong = 1 - texture(CENTRES, 1)
+    either, known, turned = (ask(CENTRES, wrong, sight, side) for side in (None, facing, -facing))
+    np.testing.assert_array_equal(known, either)
+    np.testing.assert_array_equal(turned[:, :COLOUR], either[:, :COLOUR])
+    # Only a glancing view may be on either side.
+    assert (turned[:, COLOUR] == 0).sum() >= 5 and (either[:, COLOUR] > 0.1).all()
+
+
+def test_a_plate_seen_from_both_sides_in_one_point_has_no_side() -> None:
+    points = np.array([[0.0, 0.0, 0.0]])
+    plate = box((-0.5, -0.005, -0.4), (0.5, 0.005, 0.4), 0.04, seed=1)
+    views = [photograph(plate, look_at(np.array([0.3, y, 0.0]), SIZE)) for y in (-3.0, 3.0)]
+    both = look(plate, views, SIZE, TOLERANCE)
+    assert np.abs(sides(points, np.array([[0.0, 1.0, 0.0]]), both)).max() < 0.05
 
 
 def test_a_mask_without_gaussians_is_no_free_space(solid: Gaussians) -> None:

@@ -12,7 +12,7 @@ from hingesplat.capture import View
 from hingesplat.gaussians import SH_C0, Gaussians
 from hingesplat.register import normals_of
 from hingesplat.stereo import Cloud, DepthMap, cubes, fused, seen_through
-from hingesplat.visibility import FREE, HIDDEN, SURFACE, Sight, ask, look
+from hingesplat.visibility import FREE, HIDDEN, SURFACE, Sight, ask, look, sides
 
 Pair = tuple[np.ndarray, np.ndarray]
 """Rows of the surface points of the two states, or a mask (n,) of each."""
@@ -33,11 +33,13 @@ class Surface:
     free_at_home: np.ndarray
     """(n,) ``free_share`` of the points in their own photographs: fits and stereo stick out a little."""
     sight: Sight
+    facing: np.ndarray | None = None
+    """(n, 3) the ``sides`` from which they are seen; None: nobody knows."""
 
     def rows(self, index: np.ndarray) -> "Surface":
         """The subset ``index``, seen by the same cameras."""
-        free = self.free_at_home[index]
-        return Surface(self.points[index], self.colours[index], self.normals[index], free, self.sight)
+        free, facing = self.free_at_home[index], None if self.facing is None else self.facing[index]
+        return Surface(self.points[index], self.colours[index], self.normals[index], free, self.sight, facing)
 
     def blurred(self, k: int = 8) -> np.ndarray:
         """(n, 3) mean colour of each point and its neighbours: what a coarse voxel would show."""
@@ -89,7 +91,8 @@ def surface_of(
         alone &= KDTree(cloud.points).query(points)[0] > 2 * spacing
     cloud = cloud.joined(Cloud(points[alone], normals_of(gaussians)[alone], colours[alone]))
     answer = ask(cloud.points, cloud.colours, sight)
-    surface = Surface(cloud.points, cloud.colours, cloud.normals, free_share(answer), sight)
+    facing = sides(cloud.points, cloud.normals, sight)
+    surface = Surface(cloud.points, cloud.colours, cloud.normals, free_share(answer), sight, facing)
     views_of_it = answer[:, : HIDDEN + 1].sum(1)
     return surface.rows(np.flatnonzero((answer[:, SURFACE] >= 2) & (answer[:, FREE] <= 0.15 * views_of_it)))
 

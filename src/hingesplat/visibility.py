@@ -24,6 +24,10 @@ from hingesplat.threads import parallel
 
 FREE, SURFACE, HIDDEN, COLOUR = range(4)
 """Columns of ``ask``'s answer."""
+COLOURED = 4
+"""And of the views whose colours count."""
+BEHIND = np.float32(0.2)
+"""Cosine between a side and the way to a camera from which, below 0, the camera is behind it."""
 BLOCK = 512
 """Points that are asked about at once."""
 
@@ -40,6 +44,12 @@ class Sight:
     """(v, h, w, 3) float32 photograph over white."""
     tolerance: float
     """Half-width of the band around the surface, scene units."""
+
+    @cached_property
+    def centres(self) -> np.ndarray:
+        """(v, 3) float32 where the cameras are."""
+        P = self.P.astype(np.float64)
+        return -np.linalg.solve(P[:, :, :3], P[:, :, 3:])[..., 0].astype(np.float32)
 
     @cached_property
     def reach(self) -> np.ndarray:
@@ -86,6 +96,28 @@ def look(
     return Sight(P.astype(np.float32), depth, rgb, tolerance)
 
 
+def sides(points: np.ndarray, normals: np.ndarray, sight: Sight) -> np.ndarray:
+    """(n, 3) the side from which a state's cameras see points (n, 3) of its surface, as long as it is sure, up to 1.
+
+    A thin plate has points that both sides are seen at: their side is none.
+
+    Args:
+        normals: (n, 3) unit, either side.
+    """
+    towards, views = np.zeros(len(points)), np.zeros(len(points))
+    for P, centre, depth in zip(sight.P, sight.centres, sight.depth, strict=True):
+        at = points @ P[:, :3].T + P[:, 3]
+        x, y = (np.floor(at[:, k] / np.maximum(at[:, 2], 1e-6)).astype(int) for k in (0, 1))
+        within = (at[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < depth.shape[1]) & (y < depth.shape[0])
+        there = np.flatnonzero(within)
+        shown = depth[y[there], x[there]]
+        there = there[(shown > 0) & (np.abs(shown - at[there, 2]) < sight.tolerance)]
+        way = centre - points[there]
+        towards[there] += (way * normals[there]).sum(1) / np.linalg.norm(way, axis=1)
+        views[there] += 1
+    return normals * np.clip(2 * towards / np.maximum(views, 1), -1, 1)[:, None]
+
+
 def _corrected(
     rendered: np.ndarray, camera: Camera, own: DepthMap, maps: Sequence[DepthMap], tolerance: float
 ) -> np.ndarray:
@@ -103,7 +135,9 @@ def _corrected(
 
 
 @njit(**KERNEL)
-def _ask(points, colours, P, reach, pixels, tolerance, answer, thread, threads):  # pragma: no cover - compiled
+def _ask(
+    points, colours, facing, P, centres, reach, pixels, tolerance, answer, thread, threads
+):  # pragma: no cover - compiled
     views, height, width = reach.shape[:3]
     first, last = points.shape[1] * thread // threads, points.shape[1] * (thread + 1) // threads
     answer[:, first:last] = 0
@@ -145,8 +179,14 @@ def _ask(points, colours, P, reach, pixels, tolerance, answer, thread, threads):
                         off = depth[i] - shown
                         nearer = (shown > 0) & (abs(off) < least)
                         least, signed = abs(off) if nearer else least, off if nearer else signed
+                f = (start + i) % facing.shape[1]
+                dx, dy, dz = centres[v, 0] - x[i], centres[v, 1] - y[i], centres[v, 2] - z[i]
+                towards = facing[0, f] * dx + facing[1, f] * dy + facing[2, f] * dz
+                other_side = towards < 0 and towards * towards > BEHIND * BEHIND * (dx * dx + dy * dy + dz * dz)
                 if least < tolerance:
                     surface[i] += 1
+                    if other_side:
+                        continue
                     closest, c = np.float32(3), (start + i) % colours.shape[0]
                     for b in range(-1, 2):
                         for a in range(-1, 2):
@@ -154,31 +194,39 @@ def _ask(points, colours, P, reach, pixels, tolerance, answer, thread, threads):
                             e0, e1, e2 = there[0] - colours[c, 0], there[1] - colours[c, 1], there[2] - colours[c, 2]
                             closest = min(closest, e0 * e0 + e1 * e1 + e2 * e2)
                     answer[COLOUR, start + i] += np.sqrt(closest)
+                    answer[COLOURED, start + i] += 1
                 elif signed < 0:
                     free[i] += 1
                 else:
                     hidden[i] += 1
     for i in range(first, last):
-        answer[COLOUR, i] /= max(answer[SURFACE, i], one)
+        answer[COLOUR, i] /= max(answer[COLOURED, i], one)
 
 
-def ask(points: np.ndarray, colours: np.ndarray, sight: Sight) -> np.ndarray:
+def ask(points: np.ndarray, colours: np.ndarray, sight: Sight, facing: np.ndarray | None = None) -> np.ndarray:
     """What a state's cameras say of points (n, 3) with colours (m, 3), which start again where there are fewer.
+
+    Args:
+        facing: (m, 3) the sides from which the points can be seen, as long as that is sure; None: from all around. Of
+            the surface that a camera behind a point sees there the colour is another's.
 
     Returns:
         (n, 4): the number of views in which the point is in free space, on the surface, hidden behind it; and the mean
-        Euclidean RGB difference (best of nine pixels) over the views that see it on the surface.
+        Euclidean RGB difference (best of nine pixels) over the views that see it on the surface, and from its side.
     """
-    answer = np.empty((4, len(points)), np.float32)
+    facing = np.zeros((1, 3)) if facing is None else facing
+    answer = np.empty((COLOURED + 1, len(points)), np.float32)
     parallel(
         _ask,
         torch.get_num_threads(),
         np.ascontiguousarray(points.T, dtype=np.float32),
         np.ascontiguousarray(colours, dtype=np.float32),
+        np.ascontiguousarray(facing.T, dtype=np.float32),
         sight.P,
+        sight.centres,
         sight.reach,
         sight.pixels,
         np.float32(sight.tolerance),
         answer,
     )
-    return answer.T
+    return answer[:COLOURED].T
