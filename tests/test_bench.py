@@ -369,6 +369,7 @@ def test_yardsticks_draw_what_ours_draws(monkeypatch, name: str) -> None:
         pytest.skip(why)
     # In a process of its own: how the code of others has the processor round is not felt by other tests.
     code = f"import rasteriser as r; from peers import {name}; r.check({name!r}, r.peer({name}, *r.SMALL))"
-    code += "; assert r.np.array([1e-310]) * 1.0 > 0"
+    if name == "cpp":  # It is ours: fast-math would flush small numbers to zero, as Taichi does on loading.
+        code += "; assert r.np.array([1e-310]) * 1.0 > 0"
     done = subprocess.run([sys.executable, "-c", code], cwd=benchmarks, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
