@@ -75,7 +75,7 @@ from scenes import (
     box,
     cameras_around,
     nearest,
-    one_thread,  # noqa: F401,
+    one_thread,  # noqa: F401
     photograph,
     scene,
 )

@@ -179,13 +179,12 @@ def _ask(
                         off = depth[i] - shown
                         nearer = (shown > 0) & (abs(off) < least)
                         least, signed = abs(off) if nearer else least, off if nearer else signed
-                f = (start + i) % facing.shape[1]
-                dx, dy, dz = centres[v, 0] - x[i], centres[v, 1] - y[i], centres[v, 2] - z[i]
-                towards = facing[0, f] * dx + facing[1, f] * dy + facing[2, f] * dz
-                other_side = towards < 0 and towards * towards > BEHIND * BEHIND * (dx * dx + dy * dy + dz * dz)
                 if least < tolerance:
                     surface[i] += 1
-                    if other_side:
+                    f = (start + i) % facing.shape[1]
+                    dx, dy, dz = centres[v, 0] - x[i], centres[v, 1] - y[i], centres[v, 2] - z[i]
+                    towards = facing[0, f] * dx + facing[1, f] * dy + facing[2, f] * dz
+                    if towards < 0 and towards * towards > BEHIND * BEHIND * (dx * dx + dy * dy + dz * dz):
                         continue
                     closest, c = np.float32(3), (start + i) % colours.shape[0]
                     for b in range(-1, 2):
