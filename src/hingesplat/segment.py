@@ -448,7 +448,10 @@ class _Case:
         return [motion for k, motion in enumerate(chosen) if not still(k)]
 
     def corrected(self, chosen: Sequence[Motion], photographs: Sequence[Sequence[Photograph]]) -> list[Motion]:
-        """The motions, each corrected by the texture of what it owns in state 0, then of what it owns in state 1."""
+        """The motions, each corrected by the texture of what it owns in state 0, then of what it owns in state 1.
+
+        A correction that takes these points where photographs clearly like them less is none.
+        """
         labels = self.problem.labels([m.T for m in chosen])
 
         def by_texture_of(s: int, k: int, motion: Motion) -> Motion:
