@@ -311,7 +311,7 @@ def both_ways(
     return np.concatenate([asked(first, second.sight, there, extent), asked(second, first.sight, back, extent)])
 
 
-_costs_anywhere = partial(seed_costs, far_cost=0.0)
+costs_anywhere = partial(seed_costs, far_cost=0.0)
 """How far a motion takes a seed says nothing of which of its neighbours is right."""
 
 
@@ -370,7 +370,7 @@ def _climb(
     some = e.seen((e.rng.permutation(own[0])[:most], e.rng.permutation(own[1])[:most]))
 
     def cost(motions: Sequence[Motion]) -> np.ndarray:
-        return both_ways(_costs_anywhere, some, motions, e.extent).mean(0)
+        return both_ways(costs_anywhere, some, motions, e.extent).mean(0)
 
     best = float(cost([motion])[0])
     for step in steps:
@@ -443,7 +443,7 @@ def refit(evidence: Evidence, motion: Motion, own: tuple[np.ndarray, np.ndarray]
     start = motion if s == 0 else inverted(motion)
 
     def best(motions: Sequence[Motion]) -> Motion:
-        return motions[int(both_ways(_costs_anywhere, (mine, theirs), motions, extent).sum(0).argmin())]
+        return motions[int(both_ways(costs_anywhere, (mine, theirs), motions, extent).sum(0).argmin())]
 
     if len(theirs.points) < config.min_points:
         fit = polished([start], mine, evidence.fresh[1 - s], extent)
@@ -471,7 +471,7 @@ def polished(trials: Sequence[Motion], mine: Surface, other: Surface, extent: fl
 
 def liked(motions: Sequence[Motion], mine: Surface, other: Sight, extent: float) -> Motion:
     """The best of some motions of a surface, as the other state's cameras judge them; its score says how good."""
-    costs = _costs_anywhere(mine, other, [m.T for m in motions], extent).mean(0)
+    costs = costs_anywhere(mine, other, [m.T for m in motions], extent).mean(0)
     return replace(motions[int(costs.argmin())], score=1 - float(costs.min()))
 
 

@@ -26,6 +26,7 @@ from hingesplat.hypotheses import (
     HypothesesConfig,
     both_ways,
     candidates,
+    costs_anywhere,
     oddities,
     propose_hanging,
     refit,
@@ -458,9 +459,11 @@ class _Case:
             own = self.evidence.rng.permutation(np.flatnonzero(labels[s] == k + 1))[: self.config.texture.corrected]
             some = self.problem.surfaces[s].rows(own)
             fit = fitted(motion, some, (photographs[s], photographs[1 - s]), self.evidence.extent)
-            sight, ways = self.problem.surfaces[1 - s].sight, [motion.T, fit.T]
-            costs = seed_costs(some, sight, ways, self.evidence.extent, far_cost=0.0)
-            return motion if (costs[:, 1] - costs[:, 0]).sum() > WORSE * len(own) else fit
+            if fit is motion:
+                return motion
+            there = self.problem.surfaces[1 - s].sight
+            before, after = costs_anywhere(some, there, [motion.T, fit.T], self.evidence.extent).mean(0)
+            return motion if after - before > WORSE else fit
 
         first = [by_texture_of(0, k, m) for k, m in enumerate(chosen)]
         return [inverted(by_texture_of(1, k, inverted(m))) for k, m in enumerate(first)]
