@@ -150,7 +150,8 @@ def test_a_part_of_hardly_any_gaussians_dies() -> None:
     part[torch.nonzero(part == 0)[:2]] = 2
     T = np.concatenate([made.T_state_0, made.T_state_0[:, 1:]], 1)
     T[1, 2, :3, 3] += 0.3
-    found = articulate(made.gaussians.with_part(part), T, made.views, FEW, fitted=(made.gaussians, made.at(1)))
+    same = replace(FEW, densify_every=FEW.steps + 1)  # Two that split may be 0.6 %: on one processor they did.
+    found = articulate(made.gaussians.with_part(part), T, made.views, same, fitted=(made.gaussians, made.at(1)))
     assert found.T_state_0.shape == (2, 2, 4, 4)
     assert sorted(found.gaussians.part.unique().tolist()) == [0, 1]
 
