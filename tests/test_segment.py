@@ -21,6 +21,7 @@ from hingesplat.hypotheses import (
     edges,
     groups_to_try,
     registered,
+    squared,
 )
 from hingesplat.labelling import (
     WORTH,
@@ -219,6 +220,46 @@ def test_a_hypothesis_that_is_off_climbs_to_the_motion(kind: Literal["revolute",
     assert off(wrong) > 2 * CONFIG.tolerance
     nowhere = replace(PULL, value=3.0)  # Nothing comes to lie on anything.
     assert climbed(evidence, nowhere, (first, second)) is nowhere
+
+
+def test_a_slide_that_is_nearly_square_is_square_if_photographs_hardly_mind() -> None:
+    made = made_scene("prismatic")
+    low, high, surfaces = survey((made.gaussians, made.at(1)), made.views, ((), ()), CONFIG)
+    evidence, _ = gather(surfaces, low, high, CONFIG, np.random.default_rng(0))
+    first, second = (np.flatnonzero(parts_of(made, surface, s) == 1) for s, surface in enumerate(surfaces))
+
+    def tilted(degrees: float) -> Motion:
+        axis = np.cos(np.radians(degrees)) * FORWARD + np.sin(np.radians(degrees)) * np.array([0, 0, 1])
+        return Motion("prismatic", axis, np.zeros(3), SLIDE, 1.0)
+
+    found = squared(evidence, tilted(6), (first, second))
+    assert found.axis @ FORWARD > np.cos(np.radians(1))
+    assert abs(found.value - SLIDE) < 0.01 * evidence.extent
+    far, turns, hanging = tilted(20), TURN, replace(tilted(6), after=TURN.T)
+    for motion in (far, turns, hanging):
+        assert squared(evidence, motion, (first, second)) is motion
+    assert squared(evidence, tilted(6), (first[:0], second[:0])).axis[2] > 0
+    # A little aslant of what it really does, and photographs mind.
+    went = replace(PULL, axis=tilted(14).axis)
+    aslant = posed(made.gaussians, {1: went.T})
+    views = made.views[0], tuple(photograph(aslant, v.camera) for v in made.views[1])
+    low, high, surfaces = survey((made.gaussians, aslant), views, ((), ()), CONFIG)
+    evidence, _ = gather(surfaces, low, high, CONFIG, np.random.default_rng(0))
+    rows = [
+        np.flatnonzero(made.gaussians.part.numpy()[nearest(s.points, g)] == 1)
+        for s, g in zip(surfaces, (made.gaussians, aslant), strict=True)
+    ]
+    assert squared(evidence, went, (rows[0], rows[1])) is went
+
+
+def test_a_square_slide_is_cheaper_than_one_aslant() -> None:
+    made = made_scene("prismatic")
+    low, high, surfaces = survey((made.gaussians, made.at(1)), made.views, ((), ()), CONFIG)
+    evidence, (first, second) = gather(surfaces, low, high, CONFIG, np.random.default_rng(0))
+    case = _Case.of(evidence, (first, second), CONFIG, None)
+    aslant = replace(PULL, axis=np.array([0.6, 0.8, 0]))
+    square, other, turn = case._prices([PULL, aslant, TURN])
+    assert square < 0.8 * CONFIG.part_cost < 0.9 * CONFIG.part_cost < min(other, turn)
 
 
 def test_a_seed_that_hides_says_nothing_of_a_motion() -> None:

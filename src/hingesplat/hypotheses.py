@@ -9,6 +9,7 @@ import numpy as np
 from scipy.cluster.vq import kmeans2
 from scipy.spatial import KDTree
 
+from hingesplat import square
 from hingesplat.chains import misfit
 from hingesplat.labelling import WORTH, seed_costs, seed_gains
 from hingesplat.mechanism import oddity
@@ -17,7 +18,7 @@ from hingesplat.screw import axes_across, matrix_to_screw
 from hingesplat.se3 import apart, moved
 from hingesplat.search import BASE, OLD, Motion, ScoreVolume, inverted, scan, score_volume, there_and_back
 from hingesplat.stereo import Cloud
-from hingesplat.surface import Surface, components
+from hingesplat.surface import Pair, Surface, components
 from hingesplat.visibility import Sight
 
 FLAT = 0.2
@@ -46,6 +47,9 @@ SETTLED, CLEARLY = (0.015, 0.007), 0.01
 """Steps of a motion that has been registered, and by how much each must better a point's cost in the mean."""
 GAINED = 0.3
 """By how much a motion must explain a seed better than ``WORTH`` for it to be one that it moves."""
+NEARLY_SQUARE, SQUARED_REACH, HARDLY_MINDS = 15, 0.02, 0.02
+"""Degrees from what a face looks at within which a slide is tried along it, extents by which it may go farther then,
+and what it may cost a point more, in the mean."""
 IMPOSSIBLE = 3.0
 """Oddity from which a motion is none."""
 GO_ON = 0.5
@@ -120,6 +124,11 @@ class Evidence:
         explained = np.split(costs < self.config.explained_cost, [len(self.novel[0])])
         first, second = (np.where(e, np.minimum(n, OLD), n) for e, n in zip(explained, self.novel, strict=True))
         return replace(self, novel=(first, second))
+
+    @cached_property
+    def square(self) -> np.ndarray:
+        """(d, 3) ``square.directions_of`` both surfaces."""
+        return square.directions_of(np.concatenate([s.normals for s in self.surfaces]), np.random.default_rng(0))
 
     def seen(self, seeds: Sequence[np.ndarray]) -> tuple[Surface, Surface]:
         """Of each state, the points in these rows."""
@@ -251,7 +260,7 @@ def propose(evidence: Evidence, seeds: Sequence[np.ndarray], after: np.ndarray =
     return pools
 
 
-def candidates(evidence: Evidence, seeds: Sequence[np.ndarray], judges: tuple[np.ndarray, np.ndarray]) -> list[Motion]:
+def candidates(evidence: Evidence, seeds: Sequence[np.ndarray], judges: Pair) -> list[Motion]:
     """Motions that may be those of the parts, no two of them alike; none where nothing moved.
 
     ``seeds`` and ``judges``, some of them, are rows of each state's points. A hypothesis comes from one patch, and is
@@ -277,6 +286,7 @@ def candidates(evidence: Evidence, seeds: Sequence[np.ndarray], judges: tuple[np
     for near, steps in CLIMB:
         higher = [_one_round(e, motion, judges, near, steps) for motion in climbing]
         climbing = promising(higher, APART, round(GO_ON * len(higher)))
+    higher += [squared(e, m, _both_concerned(e, m, judges, CLIMB[-1][0])) for m in higher]
     found = promising([*higher, *pool], APART, 2 * e.config.candidates)
     possible = [m for m, odd in zip(found, oddities(e, found, judges), strict=True) if odd < IMPOSSIBLE]
     return possible[: e.config.candidates]
@@ -355,15 +365,13 @@ def climbed(evidence: Evidence, motion: Motion, seeds: Sequence[np.ndarray]) -> 
 def _one_round(
     evidence: Evidence, motion: Motion, seeds: Sequence[np.ndarray], near: float, steps: Sequence[float]
 ) -> Motion:
-    own = [_concerned(evidence, s, motion if s == 0 else inverted(motion), seeds[s], near) for s in (0, 1)]
+    own = _both_concerned(evidence, motion, seeds, near)
     if min(map(len, own)) < evidence.config.min_concerned:
         return motion
-    return _climb(evidence, motion, (own[0], own[1]), steps, 1e-4)
+    return _climb(evidence, motion, own, steps, 1e-4)
 
 
-def _climb(
-    evidence: Evidence, motion: Motion, own: tuple[np.ndarray, np.ndarray], steps: Sequence[float], least: float
-) -> Motion:
+def _climb(evidence: Evidence, motion: Motion, own: Pair, steps: Sequence[float], least: float) -> Motion:
     """The motion, changed by ``steps`` as long as it costs some of the points it owns (rows) less, by ``least``."""
     e = evidence
     most = e.config.climbing_points
@@ -381,6 +389,11 @@ def _climb(
                 break
             motion, best = trials[int(costs.argmin())], float(costs.min())
     return replace(motion, score=1 - best)
+
+
+def _both_concerned(evidence: Evidence, motion: Motion, seeds: Sequence[np.ndarray], near: float) -> Pair:
+    first, second = motion, inverted(motion)
+    return _concerned(evidence, 0, first, seeds[0], near), _concerned(evidence, 1, second, seeds[1], near)
 
 
 def _concerned(evidence: Evidence, state: int, motion: Motion, seeds: np.ndarray, near: float) -> np.ndarray:
@@ -432,7 +445,7 @@ def distinct(motions: Sequence[Motion], gain: np.ndarray, points: np.ndarray, ap
     return kept
 
 
-def refit(evidence: Evidence, motion: Motion, own: tuple[np.ndarray, np.ndarray]) -> Motion:
+def refit(evidence: Evidence, motion: Motion, own: Pair) -> Motion:
     """Refine on the points that the motion owns (rows), from the state that has more of them to those of the other."""
     surfaces, extent, config, rng = evidence.surfaces, evidence.extent, evidence.config, evidence.rng
     s = int(len(own[1]) > len(own[0]))
@@ -453,7 +466,21 @@ def refit(evidence: Evidence, motion: Motion, own: tuple[np.ndarray, np.ndarray]
         once = registered(start, mine.cloud, target, extent)
         trials = [start, once, registered(once, mine.cloud, target, extent)]
         fit = best(values_around(best(trials), extent))
-    return _climb(evidence, fit if s == 0 else inverted(fit), own, SETTLED, CLEARLY)
+    return squared(evidence, _climb(evidence, fit if s == 0 else inverted(fit), own, SETTLED, CLEARLY), own)
+
+
+def squared(evidence: Evidence, motion: Motion, own: Pair) -> Motion:
+    """A slide on the base laid along what faces look at, if photographs of what it owns (rows) hardly mind."""
+    axis = square.nearest(evidence.square, motion.axis, NEARLY_SQUARE) if motion.kind == "prismatic" else None
+    if axis is None or not np.array_equal(motion.after, BASE) or min(map(len, own)) < evidence.config.min_concerned:
+        return motion
+    rng, most = np.random.default_rng(0), 2 * evidence.config.climbing_points
+    some = evidence.seen((rng.permutation(own[0])[:most], rng.permutation(own[1])[:most]))
+    values = motion.value + np.linspace(-SQUARED_REACH, SQUARED_REACH, 17) * evidence.extent
+    trials = [replace(motion, axis=axis, value=float(value)) for value in values]
+    before, *after = both_ways(costs_anywhere, some, [motion, *trials], evidence.extent).mean(0)
+    best = int(np.argmin(after))
+    return trials[best] if after[best] < before + HARDLY_MINDS else motion
 
 
 def values_around(motion: Motion, extent: float) -> list[Motion]:

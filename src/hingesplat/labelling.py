@@ -7,7 +7,9 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,6 +19,7 @@ from scipy.spatial import KDTree
 from hingesplat.mean_field import mean_field
 from hingesplat.se3 import moved
 from hingesplat.surface import Labels, Surface, free_share
+from hingesplat.territory import FOREIGN, barred, further, links, territories
 from hingesplat.visibility import COLOUR, SURFACE, Sight, ask
 
 ARRIVED = 4
@@ -40,6 +43,11 @@ UNMET = 0.5
 """What a point counts that a promising motion takes where the other state shows none."""
 MAY, KNOWN_AGAIN = 0.45, 0.3
 """Costs below which a point may follow a motion, be it out of sight, and below which it is recognised there."""
+TERRITORY, FURTHER = 20, 50
+"""Points that a motion must gain in a territory of its own, and in every one beside the best, the price of a part."""
+SMOOTHNESS = 0.25
+"""What a neighbour of the same label is worth to a point. Where points are four times as dense it is half of that: a
+wire rack between the walls behind it would be of their opinion."""
 AT_ONCE = 400_000
 """Places that photographs are asked about in one go."""
 ADDED, EXCHANGED, PAIRED, SECOND = 10, 6, 8, 2
@@ -176,6 +184,15 @@ def of_one_mind(values: np.ndarray, weights: csr_matrix) -> np.ndarray:
     return (weights @ values + values) / (1 + np.asarray(weights.sum(1)).reshape(-1, 1))
 
 
+class Settled(NamedTuple):
+    """Labels of both states' points, and what they go by."""
+
+    labels: Labels
+    energy: float
+    costs: list[np.ndarray]
+    """(n_s, labels) with those of labels that lead to the territories of others."""
+
+
 @dataclass(frozen=True)
 class Labelling:
     """The labelling problem of both states' surface points: mean field over labels, description length over motions."""
@@ -184,13 +201,24 @@ class Labelling:
     weights: tuple[csr_matrix, csr_matrix]
     trees: tuple[KDTree, KDTree]
     extent: float
-    smoothness: float = 0.25
+    density: float = 1.0
+    """Points where prices count one: as many more neighbours are heard, each of them less."""
     consistency: float = 0.6
 
     @staticmethod
-    def of(surfaces: tuple[Surface, Surface], extent: float) -> "Labelling":
+    def of(surfaces: tuple[Surface, Surface], extent: float, density: float = 1.0) -> "Labelling":
+        first, second = surfaces
         w0, w1 = (neighbour_weights(s.points, s.colours, 0.025 * extent) for s in surfaces)
-        return Labelling(surfaces, (w0, w1), (KDTree(surfaces[0].points), KDTree(surfaces[1].points)), extent)
+        return Labelling(surfaces, (w0, w1), (KDTree(first.points), KDTree(second.points)), extent, density)
+
+    @property
+    def smoothness(self) -> float:
+        return SMOOTHNESS / self.density**0.5
+
+    @cached_property
+    def links(self) -> np.ndarray:
+        """``territory.links`` of both states' points."""
+        return links(self.trees, self.extent)
 
     def costs(self, T_1_0: Sequence[np.ndarray], far_cost: float = 0.3) -> list[np.ndarray]:
         """``label_costs`` of both states' points."""
@@ -223,14 +251,31 @@ class Labelling:
         """
         return mean_field(costs, partners, self.weights, self.smoothness, self.consistency, NOBODY, iterations)
 
+    def territories(self, costs: Sequence[np.ndarray], partners: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """``territory.territories`` of every label for both states' points, (n_s, labels)."""
+        return territories(costs, partners, self.links, MAY, TERRITORY * self.density)
+
+    def settled(
+        self, costs: Sequence[np.ndarray], partners: Sequence[np.ndarray], number: Sequence[np.ndarray]
+    ) -> Settled:
+        """Labels that keep to their territories, numbered (n_s, labels); the energy counts those beside the best."""
+        costs = barred(costs, [n == FOREIGN for n in number])
+        labels, energy = self.mean_field(costs, partners)
+        price = FURTHER * self.density
+        worthy, away = further(costs, number, labels, price)
+        if any(a.any() for a in away):
+            costs = barred(costs, away)
+            labels, energy = self.mean_field(costs, partners)
+        return Settled(labels, energy + worthy * price, costs)
+
     def labels(self, T_1_0: Sequence[np.ndarray]) -> Labels:
         """Labels of both states' points under these motions, all of which stay."""
         return self.labels_and_meeting(T_1_0)[0]
 
     def labels_and_meeting(self, T_1_0: Sequence[np.ndarray]) -> tuple[Labels, np.ndarray]:
         """The same, and ``meeting`` of each motion."""
-        partners = self.partners(T_1_0)
-        owned = self.mean_field(self.costs(T_1_0), partners)[0]
+        costs, partners = self.costs(T_1_0), self.partners(T_1_0)
+        owned = self.settled(costs, partners, self.territories(costs, partners)).labels
         return owned, meeting(partners, owned)
 
 
@@ -266,6 +311,7 @@ class Choices:
         self.problem, self.number = problem, len(T_1_0)
         self._costs = [costs.astype(np.float32) for costs in problem.costs(T_1_0)]
         self._partners = problem.partners(T_1_0)
+        self._territories = problem.territories(self._costs, self._partners)
         met = [partners >= 0 for partners in self._partners]
         # What each label would cost a point if its partner and its neighbours agreed; who hides may be anywhere.
         self._agreed = [
@@ -282,21 +328,25 @@ class Choices:
             return self
         both, more = copy(self), Choices(self.problem, T_1_0)
         both.number = self.number + more.number
-        for name in ("_costs", "_partners", "_agreed", "_seen"):
+        for name in ("_costs", "_partners", "_agreed", "_seen", "_territories"):
             columns = zip(getattr(self, name), getattr(more, name), strict=True)
             setattr(both, name, [np.concatenate([mine, theirs[:, 1:]], 1) for mine, theirs in columns])
         both._promises = {}
         return both
 
+    def _settled(self, kept: frozenset[int]) -> Settled:
+        """The set's, its labels and costs being those to stay and of the motions in order."""
+        columns = [0, *(k + 1 for k in sorted(kept))]
+        # Fewer iterations would leave energies off by as much as one look-alike differs from another.
+        tables = self._costs, self._partners, self._territories
+        return self.problem.settled(*([each[:, columns] for each in table] for table in tables))
+
     def _solved(self, kept: frozenset[int]) -> tuple[Labels, float]:
-        """Labels that are columns of the costs, and their energy."""
+        """Labels that are columns of all costs, and their energy."""
         if kept not in self._solutions:
-            columns = [0, *(k + 1 for k in sorted(kept))]
-            # Fewer iterations would leave energies off by as much as one look-alike differs from another.
-            (first, second), energy = self.problem.mean_field(
-                [c[:, columns] for c in self._costs], [p[:, columns] for p in self._partners]
-            )
-            self._solutions[kept] = (np.array(columns)[first], np.array(columns)[second]), energy
+            (first, second), energy, _ = self._settled(kept)
+            columns = np.array([0, *(k + 1 for k in sorted(kept))])
+            self._solutions[kept] = (columns[first], columns[second]), energy
         return self._solutions[kept]
 
     def best(self, prices: np.ndarray, parts: int | None) -> frozenset[int]:
@@ -333,13 +383,12 @@ class Choices:
 
         A frame round a hole, and one round another hole in the other state, make a motion that only hearsay speaks for.
         """
-        labels, columns = self._solved(kept)[0], [0, *(k + 1 for k in sorted(kept))]
+        labels, _, costs = self._settled(kept)
         better = dict.fromkeys(kept, 0.0)
-        for costs, label in zip(self._costs, labels, strict=True):
-            for k in kept:
-                own = costs[label == k + 1]
-                others = own[:, [column for column in columns if column != k + 1]]
-                better[k] += float((others.min(1) - own[:, k + 1]).sum())
+        for cost, label in zip(costs, labels, strict=True):
+            for i, k in enumerate(sorted(kept), 1):
+                own = cost[label == i]
+                better[k] += float((np.delete(own, i, axis=1).min(1) - own[:, i]).sum())
         return better
 
     def stand_ins(self, kept: Collection[int], k: int) -> tuple[np.ndarray, np.ndarray]:

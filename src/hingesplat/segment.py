@@ -45,6 +45,7 @@ from hingesplat.pieces import (
 )
 from hingesplat.se3 import apart
 from hingesplat.search import BASE, Motion, carrier_of, inverted, novelty
+from hingesplat.square import nearest
 from hingesplat.stereo import DepthMap
 from hingesplat.surface import Labels, Pair, Surface, bounds, surface_of, thin
 from hingesplat.texture import (
@@ -83,6 +84,9 @@ HEARINGS = 2
 """Times at most that rivals are heard, the second time those of what texture left."""
 STAYS = 0.8
 """Share of its price for which a motion stays that was chosen among all: what is worth just that would come and go."""
+SQUARE, SQUARE_SLIDE = 3, 0.7
+"""Degrees from what a face looks at within which a slide is square, and part of a price that it costs: two numbers
+less say where it leads."""
 WORSE = 0.04
 """By how much photographs may like a motion less, in the mean over its points, once texture has corrected it: right
 corrections cost 0.03 at most, those of a door by what it had taken along of a wire rack 0.05 to 0.33."""
@@ -224,7 +228,7 @@ def segment(
     if not any(carrier_of(m, chosen) is not None for m in chosen):
         chosen = case.corrected(chosen, photographs)
         chosen = case.heard_again(chosen, found, photographs, seed)
-    chosen, owned = _labelled(chosen, surfaces, photographs, evidence.extent, config, parts, seed)
+    chosen, owned = _labelled(case, chosen, photographs, seed)
     costs = _seed_costs(evidence, judges, chosen) if chosen else np.ones((1, 1))
     unexplained = float((costs.min(1) >= config.hypotheses.explained_cost).mean())
     labels = tuple(spread_labels(gaussians[s].means.numpy(), surfaces[s], owned[s]) for s in (0, 1))
@@ -312,8 +316,11 @@ class _Case:
         return [motions[k] for k in prices], [STAYS * p for p in prices.values()]
 
     def _prices(self, motions: Sequence[Motion]) -> np.ndarray:
-        """(motions,) what each costs before texture is asked, in points: odd joints more."""
-        return self.config.part_cost * (1 + oddities(self.evidence, motions, self.seeds))
+        """(motions,) what each costs before texture is asked, in points: odd joints more, square slides less."""
+        slides = [m for m in motions if m.kind == "prismatic"]
+        along = {id(m) for m in slides if nearest(self.evidence.square, m.axis, SQUARE) is not None}
+        usual = np.array([SQUARE_SLIDE if id(m) in along else 1.0 for m in motions])
+        return self.config.part_cost * (usual + oddities(self.evidence, motions, self.seeds))
 
     def _rivals(self, choices: Choices, motions: Sequence[Motion], kept: frozenset[int]) -> list[Motion]:
         """What might stand in place of one or two of the motions kept, each fitted to what would be its own then.
@@ -470,18 +477,15 @@ class _Case:
 
 
 def _labelled(
-    motions: list[Motion],
-    surfaces: tuple[Surface, Surface],
-    photographs: Sequence[Sequence[Photograph]],
-    extent: float,
-    config: SegmentConfig,
-    parts: int | None,
-    seed: int,
+    case: _Case, motions: list[Motion], photographs: Sequence[Sequence[Photograph]], seed: int
 ) -> tuple[list[Motion], Labels]:
     """The parts that these motions make, each one piece, and labels of all points of both states."""
-    problem = Labelling.of(surfaces, extent)
+    surfaces, extent, config, parts = case.evidence.surfaces, case.evidence.extent, case.config, case.parts
+    count, thinned = (sum(len(s.points) for s in some) for some in (surfaces, case.problem.surfaces))
+    problem = Labelling.of(surfaces, extent, count / thinned)
     while True:
-        owned, met = problem.labels_and_meeting([m.T for m in motions])
+        transforms = [m.T for m in motions]
+        owned, met = problem.labels(transforms), case.problem.labels_and_meeting(transforms)[1]
         share = lying_on(owned, len(motions), surfaces, extent)
         own_joint = np.array([not m.by_texture and carrier_of(m, motions) is None for m in motions], float)
         doubts = MEETING - met, passed_on(share) - PASSED_ON, own_joint * riding(share) - RIDING
