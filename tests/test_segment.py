@@ -665,6 +665,8 @@ def test_an_odd_joint_is_in_doubt_before_texture_says_anything(turned: Turned) -
     says = {usual: 5.0, 1 - usual: -3.0}
     assert told_apart(choices, lambda k, _: says[k], [28, 28, 28], None) == {usual: 28}
     assert told_apart(choices, lambda k, _: says[k], [28, 28, 20], None) == {1 - usual: 25}
+    # A slide that costs less than a hinge does not make hinges odd.
+    assert told_apart(choices, lambda k, _: says[k], [28, 28, 20], None, [28, 28, 20]) == {usual: 28}
 
 
 def test_something_moved_so_one_motion_is_had_for_half_its_price(turned: Turned) -> None:
@@ -753,6 +755,18 @@ def test_what_texture_says_has_stayed_has_not_moved(monkeypatch, along: int, sti
     evidence, (first, second) = gather(surfaces, low, high, CONFIG, np.random.default_rng(0))
     case = _Case.of(evidence, (first, second), CONFIG, None)
     assert case.without_still([TURN], [[], []], 0) == [TURN][:kept]
+
+
+def test_what_thinned_points_said_is_heard(turned: Turned) -> None:
+    """Two motions that are the same: a point follows the one that its thinned neighbours follow."""
+    _, surfaces, extent = turned
+    problem = Labelling.of(surfaces, extent)
+    (usual,) = set(np.concatenate(problem.labels([TURN.T, TURN.T]))) - {0}
+    one = problem.labels([TURN.T])
+    for said in (usual, 3 - usual):
+        found = problem.labels([TURN.T, TURN.T], (said * one[0], said * one[1]))
+        for s in (0, 1):
+            np.testing.assert_array_equal(found[s], said * one[s])
 
 
 def test_a_part_meets_itself_and_what_merely_hides_does_not(turned: Turned) -> None:
@@ -1072,7 +1086,7 @@ def test_what_is_left_without_points_in_one_state_is_no_part(monkeypatch) -> Non
 
     def kept(motions: list[Motion], owned: Labels, least: int) -> tuple[list[Motion], Labels]:
         first, second = (plain(np.zeros((len(label), 3))) for label in owned)
-        return seen_to_move(motions, owned, (first, second), least)
+        return seen_to_move(motions, owned, (first, second), 1.0, least)
 
     motions, first = [SHIFT, inverted(SHIFT), SHIFT], np.repeat([0, 1, 2, 3], [5000, 400, 300, 200])
     second = np.repeat([0, 1, 2, 3], [5000, 500, 10, 25])
@@ -1091,17 +1105,30 @@ def test_what_neither_state_shows_to_have_gone_has_not_moved(monkeypatch) -> Non
     went = iter([np.repeat([False, True, False], [1000, 20, 80]), np.repeat([False, True, False], [1000, 40, 60])])
     monkeypatch.setattr("hingesplat.pieces.gone", lambda *_: next(went))
     label, surfaces = np.repeat([0, 1, 2], [1000, 50, 50]), (plain(np.zeros((1100, 3))), plain(np.zeros((1100, 3))))
-    motions, labels = seen_to_move([SHIFT, inverted(SHIFT)], (label, label), surfaces, 25)
+    motions, labels = seen_to_move([SHIFT, inverted(SHIFT)], (label, label), surfaces, 1.0, 25)
     assert motions == [SHIFT]
     for found in labels:
         np.testing.assert_array_equal(found, np.repeat([0, 1, 0], [1000, 50, 50]))
 
 
+@pytest.mark.parametrize(("empty", "kept"), [(0.9, 1), (0.4, 0)])
+def test_a_part_has_gone_from_where_it_has_not_come_to_lie(monkeypatch, empty: float, kept: int) -> None:
+    """A bulge in one state's depth of a white wall would slide back into it, but the wall is where it was."""
+    plate = patch((0, 0, 0), 15, 0.02)
+    shift = Motion("prismatic", FORWARD, np.zeros(3), 0.15, 1.0)
+    first, second = plain(plate), plain(moved(plate, shift.T))
+    ahead = [plate[:, 1] > -0.0, plate[:, 1] < -0.02]
+    went = iter([a & (np.arange(len(a)) % 10 < 10 * empty) for a in ahead])
+    monkeypatch.setattr("hingesplat.pieces.gone", lambda *_: next(went))
+    label = np.ones(len(plate), int)
+    assert len(seen_to_move([shift], (label, label), (first, second), 1.0, 10)[0]) == kept
+
+
 def test_a_long_panel_that_slides_over_itself_has_moved(monkeypatch) -> None:
     monkeypatch.setattr("hingesplat.pieces.gone", lambda *_: np.repeat([False, True, False], [1000, 120, 880]))
     label, surfaces = np.repeat([0, 1], [1000, 1000]), (plain(np.zeros((2000, 3))), plain(np.zeros((2000, 3))))
-    assert seen_to_move([SHIFT], (label, label), surfaces, 25)[0] == [SHIFT]
-    assert seen_to_move([SHIFT], (label, label), surfaces, 35)[0] == []
+    assert seen_to_move([SHIFT], (label, label), surfaces, 1.0, 25)[0] == [SHIFT]
+    assert seen_to_move([SHIFT], (label, label), surfaces, 1.0, 35)[0] == []
 
 
 @pytest.mark.parametrize("kind", ["revolute", "prismatic"])

@@ -76,6 +76,17 @@ def test_two_states_points_that_meet_are_one_piece() -> None:
     assert apart[0][0, 1] != apart[1][0, 1]
 
 
+def test_a_few_points_are_no_bridge() -> None:
+    """A string of points hangs between a door and the rack behind it."""
+    string = np.stack([np.full(4, 0.1), np.linspace(0.16, 0.26, 4), np.zeros(4)], 1)
+    points = np.concatenate([patch(), patch(AWAY), string])
+    costs = [np.stack([np.ones(84), np.concatenate([HIDES[0], np.full(4, 0.5)])], 1)] * 2
+    partners = [np.stack([np.full(84, -1), np.concatenate([DOOR, NOBODY, np.full(4, -1)])], 1)] * 2
+    joined_by = links((KDTree(points), KDTree(points)), 1.0)
+    mine, _ = territories(costs, partners, joined_by, MAY, 20)
+    assert (mine[:40, 1] > 0).all() and (mine[40:80, 1] == FOREIGN).all()
+
+
 def test_further_territories_pay_or_are_left_to_others() -> None:
     """Two doors of one motion, the second of which is hardly better off with it than with another motion."""
     number = [np.repeat([[0, 1, 1], [0, 2, 1]], 40, 0)] * 2

@@ -47,7 +47,7 @@ SETTLED, CLEARLY = (0.015, 0.007), 0.01
 """Steps of a motion that has been registered, and by how much each must better a point's cost in the mean."""
 GAINED = 0.3
 """By how much a motion must explain a seed better than ``WORTH`` for it to be one that it moves."""
-NEARLY_SQUARE, SQUARED_REACH, HARDLY_MINDS = 15, 0.02, 0.02
+NEARLY_SQUARE, SQUARED_REACH, HARDLY_MINDS = 15, 0.03, 0.02
 """Degrees from what a face looks at within which a slide is tried along it, extents by which it may go farther then,
 and what it may cost a point more, in the mean."""
 IMPOSSIBLE = 3.0
@@ -472,11 +472,11 @@ def refit(evidence: Evidence, motion: Motion, own: Pair) -> Motion:
 def squared(evidence: Evidence, motion: Motion, own: Pair) -> Motion:
     """A slide on the base laid along what faces look at, if photographs of what it owns (rows) hardly mind."""
     axis = square.nearest(evidence.square, motion.axis, NEARLY_SQUARE) if motion.kind == "prismatic" else None
-    if axis is None or not np.array_equal(motion.after, BASE) or min(map(len, own)) < evidence.config.min_concerned:
+    if axis is None or not np.array_equal(motion.after, BASE) or sum(map(len, own)) < 2 * evidence.config.min_concerned:
         return motion
     rng, most = np.random.default_rng(0), 2 * evidence.config.climbing_points
     some = evidence.seen((rng.permutation(own[0])[:most], rng.permutation(own[1])[:most]))
-    values = motion.value + np.linspace(-SQUARED_REACH, SQUARED_REACH, 17) * evidence.extent
+    values = motion.value + np.linspace(-SQUARED_REACH, SQUARED_REACH, 25) * evidence.extent
     trials = [replace(motion, axis=axis, value=float(value)) for value in values]
     before, *after = both_ways(costs_anywhere, some, [motion, *trials], evidence.extent).mean(0)
     best = int(np.argmin(after))

@@ -28,6 +28,9 @@ THIN = 0.25
 GONE = 0.3
 """Share of a part's points that one of the states at least must show to have gone, or four times the fewest of a part:
 a long panel slides over itself."""
+LEFT, EMPTY = 0.03, 0.55
+"""Extents from all of a part in the other state, from which it has left a point's place; and share of such places that
+one of the states must show empty: right parts had 0.84 and more, the bulge of a white wall 0.48."""
 PLATE = 0.06
 """Extents between the two sides of a plate at most."""
 UNDER = 0.1
@@ -249,22 +252,40 @@ def riding(share: np.ndarray) -> np.ndarray:
 
 
 def seen_to_move(
-    motions: Sequence[Motion], owned: Labels, surfaces: tuple[Surface, Surface], min_points: int
+    motions: Sequence[Motion], owned: Labels, surfaces: tuple[Surface, Surface], extent: float, min_points: int
 ) -> tuple[list[Motion], Labels]:
     """The parts that both states show, and one at least where they have gone; labels that count these.
 
     The points of the others are base: walls without texture, of which two states' depth differs, that a slight turn
-    would explain.
+    or a short slide would explain. A part is gone from all places but those where it has come to lie.
     """
     counts = [np.bincount(label, minlength=1 + len(motions))[1:] for label in owned]
     shown = [c > min(LEAST_SHARE * len(label), min_points - 1) for c, label in zip(counts, owned, strict=True)]
     went = [gone(surfaces[s], surfaces[1 - s].sight) for s in (0, 1)]
     many = [np.bincount(o, g, 1 + len(motions))[1:] for o, g in zip(owned, went, strict=True)]
     moved_on = [(m > GONE * c) | (m > 4 * min_points) for m, c in zip(many, counts, strict=True)]
-    kept = np.flatnonzero(shown[0] & shown[1] & (moved_on[0] | moved_on[1]))
+    left = [_left_behind(k, m.T, owned, surfaces, extent) for k, m in enumerate(motions, 1)]
+    empty = np.ones(len(motions), bool)
+    for k, places in enumerate(left):
+        asked = [w[at] for w, at in zip(went, places, strict=True) if len(at) >= min_points]
+        empty[k] = not asked or max(w.mean() for w in asked) > EMPTY
+    kept = np.flatnonzero(shown[0] & shown[1] & (moved_on[0] | moved_on[1]) & empty)
     rank = np.zeros(1 + len(motions), int)
     rank[1 + kept] = np.arange(1, 1 + len(kept))
     return [motions[int(k)] for k in kept], (rank[owned[0]], rank[owned[1]])
+
+
+def _left_behind(
+    label: int, T_1_0: np.ndarray, owned: Labels, surfaces: tuple[Surface, Surface], extent: float
+) -> list[np.ndarray]:
+    """Rows of a part's points in each state where the other state has nothing of it."""
+    rows = [np.flatnonzero(o == label) for o in owned]
+    first, second = (s.points[r] for s, r in zip(surfaces, rows, strict=True))
+    there = np.concatenate([moved(first, T_1_0), second]), np.concatenate([first, moved(second, np.linalg.inv(T_1_0))])
+    if len(there[0]) == 0:
+        return rows
+    ways = zip(rows, (first, second), there, strict=True)
+    return [row[np.asarray(KDTree(other).query(here)[0]) > LEFT * extent] for row, here, other in ways]
 
 
 def _pieces(

@@ -10,7 +10,7 @@ nearest point.
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from functools import wraps
-from itertools import combinations
+from itertools import chain, combinations
 from typing import TypeVar
 
 import numpy as np
@@ -79,7 +79,7 @@ DISCOUNT = 2.5
 """Part of a price, for all of the patches asked, that texture pays: 16 and 25 % of those of drawers went along, 9 and
 10 % of those of handles that were alike."""
 RIVALS = 6
-"""Motions that are heard in place of each of the best, and of each two of them."""
+"""Motions that are heard beside the best, in place of each of them, and of each two."""
 HEARINGS = 2
 """Times at most that rivals are heard, the second time those of what texture left."""
 STAYS = 0.8
@@ -295,10 +295,10 @@ class _Case:
             rivals = self._rivals(choices, motions, kept)
             choices, motions = choices.with_more([m.T for m in rivals]), [*motions, *rivals]
             usual = np.concatenate([usual, self._prices(rivals)])
-            told = told_apart(choices, verdict, usual, self.parts)
+            told = told_apart(choices, verdict, usual, self.parts, self._plain_prices(motions))
             while exchanges := self._exchanges(choices, motions, told):
                 usual[np.any(list(exchanges.values()), axis=0)] = np.inf
-                told = told_apart(choices, verdict, usual, self.parts)
+                told = told_apart(choices, verdict, usual, self.parts, self._plain_prices(motions))
             if all(p <= usual[k] for k, p in told.items()):
                 break
             kept = frozenset(told)
@@ -315,20 +315,22 @@ class _Case:
         )
         return [motions[k] for k in prices], [STAYS * p for p in prices.values()]
 
+    def _plain_prices(self, motions: Sequence[Motion]) -> np.ndarray:
+        """(motions,) what each costs if nothing is odd about it, in points: square slides less."""
+        square = [m.kind == "prismatic" and nearest(self.evidence.square, m.axis, SQUARE) is not None for m in motions]
+        return self.config.part_cost * np.where(square, SQUARE_SLIDE, 1.0)
+
     def _prices(self, motions: Sequence[Motion]) -> np.ndarray:
-        """(motions,) what each costs before texture is asked, in points: odd joints more, square slides less."""
-        slides = [m for m in motions if m.kind == "prismatic"]
-        along = {id(m) for m in slides if nearest(self.evidence.square, m.axis, SQUARE) is not None}
-        usual = np.array([SQUARE_SLIDE if id(m) in along else 1.0 for m in motions])
-        return self.config.part_cost * (usual + oddities(self.evidence, motions, self.seeds))
+        """(motions,) what each costs before texture is asked, in points: odd joints more."""
+        return self._plain_prices(motions) + self.config.part_cost * oddities(self.evidence, motions, self.seeds)
 
     def _rivals(self, choices: Choices, motions: Sequence[Motion], kept: frozenset[int]) -> list[Motion]:
-        """What might stand in place of one or two of the motions kept, each fitted to what would be its own then.
+        """What might stand beside the motions kept, or in place of one or two, fitted to what would be its own then.
 
         Look-alikes that meet by chance meet at once; a right motion that is 2 % off explains less than they do.
         """
         found: dict[int, Motion] = {}
-        for out in [*combinations(sorted(kept), 1), *combinations(sorted(kept), 2)]:
+        for out in chain.from_iterable(combinations(sorted(kept), n) for n in range(3)):
             less = kept - set(out)
             for k in [k for k in choices.promising(less) if k not in kept][:RIVALS]:
                 if k not in found:
@@ -481,11 +483,14 @@ def _labelled(
 ) -> tuple[list[Motion], Labels]:
     """The parts that these motions make, each one piece, and labels of all points of both states."""
     surfaces, extent, config, parts = case.evidence.surfaces, case.evidence.extent, case.config, case.parts
-    count, thinned = (sum(len(s.points) for s in some) for some in (surfaces, case.problem.surfaces))
-    problem = Labelling.of(surfaces, extent, count / thinned)
+    count, few = (sum(len(s.points) for s in some) for some in (surfaces, case.problem.surfaces))
+    problem = Labelling.of(surfaces, extent, count / few)
     while True:
         transforms = [m.T for m in motions]
-        owned, met = problem.labels(transforms), case.problem.labels_and_meeting(transforms)[1]
+        thinned, met = case.problem.labels_and_meeting(transforms)
+        each = zip(surfaces, case.problem.surfaces, thinned, strict=True)
+        first, second = (spread_labels(s.points, thin, label) for s, thin, label in each)
+        owned = problem.labels(transforms, (first, second))
         share = lying_on(owned, len(motions), surfaces, extent)
         own_joint = np.array([not m.by_texture and carrier_of(m, motions) is None for m in motions], float)
         doubts = MEETING - met, passed_on(share) - PASSED_ON, own_joint * riding(share) - RIDING
@@ -509,7 +514,7 @@ def _labelled(
         return likeness(compared(surfaces, photographs, T, mine, extent, config.texture, seed))
 
     owned = unless_still(transforms, owned, bordered(transforms, owned, problem, told), texture)
-    return seen_to_move(motions, owned, surfaces, config.min_part_seeds)
+    return seen_to_move(motions, owned, surfaces, extent, config.min_part_seeds)
 
 
 def _seen_to_explain(choices: Choices, kept: frozenset[int], prices: Sequence[float]) -> frozenset[int]:

@@ -20,6 +20,8 @@ RATHER = 0.1
 """By how much a motion must cost a point less than to stay, for the point to lie in one of its territories."""
 FOREIGN = -1
 """Number of a territory in which nothing says that the motion has been there."""
+FEW = 5
+"""Points that a motion may hold in a territory for nothing: to settle all labels anew for them takes twice as long."""
 BARRED = 10.0
 """Cost of a label in a territory that is not its motion's."""
 
@@ -35,8 +37,8 @@ def territories(
 ) -> list[np.ndarray]:
     """(n_s, labels) int32 number of the territory of each label in which each point lies; 0: in none, or ``FOREIGN``.
 
-    Points that a motion lays on each other hang together as well. Where nothing meets, or hardly anything, is foreign,
-    but for the best.
+    Points that a motion lays on each other hang together as well, and a few are no bridge. Where nothing meets, or
+    hardly anything, is foreign, but for the best.
 
     Args:
         costs: (n_s, labels) of both states' points, the first label to stay.
@@ -58,6 +60,7 @@ def territories(
         met = (there >= 0) & (cost[there, k] < may)
         both = met & follows[there]
         edges = np.concatenate([links[follows[links].all(1)], np.stack([row[both], there[both]], 1)])
+        edges = _without_bridges(edges, row)
         graph = coo_matrix((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
         piece = connected_components(graph, directed=False)[1]
         worth = np.bincount(piece[row[met]], gain[row[met], k], piece.max() + 1)
@@ -65,6 +68,16 @@ def territories(
         own[worth.argmax()] = True
         number[row, k] = np.where(own, 1 + np.arange(len(own)), FOREIGN)[piece[row]]
     return np.split(number, [n])
+
+
+def _without_bridges(edges: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """The edges (m, 2) without all but one of each of the rows that have less than half the usual number of them."""
+    degree = np.bincount(edges.ravel(), minlength=row.max() + 1)
+    dense = 2 * degree >= np.median(degree[row])
+    ends = dense[edges]
+    joins = edges[ends[:, 0] != ends[:, 1]]
+    sparse = np.where(dense[joins[:, 0]], joins[:, 1], joins[:, 0])
+    return np.concatenate([edges[ends.all(1)], joins[np.unique(sparse, return_index=True)[1]]])
 
 
 def barred(costs: Sequence[np.ndarray], foreign: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -84,15 +97,16 @@ def further(
     """
     worthy, away = 0, [np.zeros(n.shape, bool) for n in number]
     for k in range(1, costs[0].shape[1]):
-        gains = np.zeros(1 + max(int(n[:, k].max(initial=0)) for n in number))
+        size = 1 + max(int(n[:, k].max(initial=0)) for n in number)
+        gains, held = np.zeros(size), np.zeros(size, int)
         for cost, mine, label in zip(costs, number, labels, strict=True):
             own = np.flatnonzero((label == k) & (mine[:, k] > 0))
             gain = np.delete(cost[own], k, axis=1).min(1) - cost[own, k]
-            # Held at all, a territory counts, however little it gains.
-            gains += np.bincount(mine[own, k], np.maximum(gain, 1e-6), len(gains))
-        gains[gains.argmax()] = 0
-        worthy += int((gains >= price).sum())
-        left = (gains > 0) & (gains < price)
+            gains += np.bincount(mine[own, k], np.maximum(gain, 0), size)
+            held += np.bincount(mine[own, k], minlength=size)
+        others = (held > FEW) & (np.arange(size) != gains.argmax())
+        worthy += int((others & (gains >= price)).sum())
+        left = others & (gains < price)
         for mine, out in zip(number, away, strict=True):
             out[:, k] = left[np.maximum(mine[:, k], 0)]
     return worthy, away

@@ -58,7 +58,11 @@ class TextureConfig:
 
 
 def told_apart(
-    choices: Choices, verdict: Callable[[int, Pair], float], price: ArrayLike, parts: int | None
+    choices: Choices,
+    verdict: Callable[[int, Pair], float],
+    price: ArrayLike,
+    parts: int | None,
+    plain: ArrayLike | None = None,
 ) -> dict[int, float]:
     """The motions that explain both states at the least description length, texture counting, and their prices.
 
@@ -71,8 +75,10 @@ def told_apart(
             each state.
         price: of each motion, in points, or of every one.
         parts: choose no more than this many.
+        plain: price of each if nothing were odd about it, where they differ.
     """
     usual = np.broadcast_to(np.asarray(price, float), choices.number)
+    even = np.broadcast_to(usual.min(initial=np.inf) if plain is None else np.asarray(plain, float), choices.number)
     if not choices.best(usual, parts):
         usual, parts = LEAST * usual, 1
     said: dict[int, float] = {}
@@ -87,7 +93,7 @@ def told_apart(
             mine = kept.index(k) + 1
             said[k] = verdict(k, (first == mine, second == mine))
         # What is odd for a joint is in doubt by that much already.
-        if all(usual[k] + against <= (1 + DOUBT) * usual.min() for k, against in said.items()):
+        if all(usual[k] + against <= (1 + DOUBT) * even[k] for k, against in said.items()):
             return {k: float(usual[k]) for k in kept}
         # What has not been asked about may be as good as any.
         prices = LEAST * usual
