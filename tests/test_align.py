@@ -44,6 +44,17 @@ def test_a_flap_shown_from_one_side_in_each_state_comes_to_its_place() -> None:
     assert angle_between(found[1, 1], made.T_state_0[1, 1]) < 1.5
 
 
+@pytest.mark.parametrize(("off", "put_right"), [(8.0, False), (1.5, True)])
+def test_what_a_slit_shows_is_put_right_by_a_little_only(off: float, put_right: bool) -> None:
+    made = scene("revolute", 64, 0.06)
+    slab = made.gaussians.part.numpy() == 1
+    few = ~slab | (np.cumsum(slab) % 12 == 0)
+    T = off_by(made, off)
+    found = aligned(made, T, keep=(few, np.ones(len(slab), bool)))
+    assert (distance(found, made) < 0.5 * distance(T, made)) == put_right
+    assert np.array_equal(found, T) != put_right
+
+
 def test_what_is_known_stays() -> None:
     """Texture had put a door right, and photographs that showed its inside in one state only drew it off by 4°."""
     made = scene("revolute", 48, 0.08)

@@ -80,7 +80,7 @@ def told_apart(
     usual = np.broadcast_to(np.asarray(price, float), choices.number)
     even = np.broadcast_to(usual.min(initial=np.inf) if plain is None else np.asarray(plain, float), choices.number)
     if not choices.best(usual, parts):
-        usual, parts = LEAST * usual, 1
+        usual, even, parts = LEAST * usual, LEAST * even, 1
     said: dict[int, float] = {}
     prices = usual
     while True:
