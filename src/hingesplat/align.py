@@ -22,9 +22,9 @@ from hingesplat.training import evenly, shown, shuffled, thinned, training_views
 
 JUDGES = 25
 """Photographs of a state that say what is seen, and whether an alignment has made things better."""
-SLIT, JUMP = 0.1, 0.03
+SLIT, JUMP = 0.1, 0.015
 """Share of a part that one state shows beside the other, below which it is put right by no more than these extents, in
-the mean over its Gaussians: wire racks behind a door had gone on by a bar or two, 0.04 and 0.07."""
+the mean over its Gaussians: wire racks behind a door had gone on by a bar or two, or aslant, 0.02 to 0.12."""
 
 
 @dataclass(frozen=True)
@@ -101,9 +101,11 @@ def align(
     shares = [torch.bincount(g.part, minlength=parts)[1:].cpu().numpy() for g in (first, second)]
     slit = np.minimum(*shares) < SLIT * np.maximum(*shares)
     far = np.zeros(parts - 1, bool)
-    for k in np.flatnonzero(slit & (shares[0] > 0)) + 1:
-        points = first.means[first.part == k].cpu().numpy()
-        far[k - 1] = apart(points, found[other, k], T_state_0[other, k]) > JUMP * extent
+    for k in np.flatnonzero(slit) + 1:
+        more = first if shares[0][k - 1] > shares[1][k - 1] else second
+        ways = found[other, k], T_state_0[other, k]
+        here = ways if more is first else [np.linalg.inv(T) for T in ways]
+        far[k - 1] = apart(more.means[more.part == k].cpu().numpy(), *here) > JUMP * extent
     better = np.concatenate([[False], free & (now < was) & ~far])
     return np.where(better[:, None, None], found, T_state_0)
 
