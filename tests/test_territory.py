@@ -99,6 +99,9 @@ def test_further_territories_pay_or_are_left_to_others() -> None:
     assert worthy == 0
     for a in away:
         np.testing.assert_array_equal(a, np.repeat([[False, False, False], [False, True, False]], 40, 0))
+    alone = [np.repeat([[0, 1, 0], [0, 1, 0]], 40, 0)] * 2
+    same = joined(STAY, [np.full(80, 0.1)] * 2, [np.full(80, 0.1)] * 2)
+    assert not any(a.any() for a in further(same, alone, labels, 1.0)[1])  # Its only territory, for all it gains.
     for before, after in zip(costs, barred(costs, away), strict=True):
         np.testing.assert_allclose(after - before, BARRED * np.repeat([[0, 0, 0], [0, 1, 0]], 40, 0), atol=1e-6)
 

@@ -104,7 +104,8 @@ def further(
             gain = np.delete(cost[own], k, axis=1).min(1) - cost[own, k]
             gains += np.bincount(mine[own, k], np.maximum(gain, 0), size)
             held += np.bincount(mine[own, k], minlength=size)
-        others = (held > FEW) & (np.arange(size) != gains.argmax())
+        # Of two motions that are the same neither gains anything: then it is the one that holds most.
+        others = (held > FEW) & (np.arange(size) != (gains + 1e-6 * held).argmax())
         worthy += int((others & (gains >= price)).sum())
         left = others & (gains < price)
         for mine, out in zip(number, away, strict=True):
