@@ -28,7 +28,7 @@ THIN = 0.25
 GONE = 0.3
 """Share of a part's points that one of the states at least must show to have gone, or four times the fewest of a part:
 a long panel slides over itself."""
-LEFT, EMPTY = 0.03, 0.55
+LEFT, EMPTY = 0.03, 0.5
 """Extents from all of a part in the other state, from which it has left a point's place; and share of such places that
 one of the states must show empty: right parts had 0.84 and more, the bulge of a white wall 0.48."""
 PLATE = 0.06
