@@ -35,6 +35,7 @@ MEETS = [np.concatenate([DOOR, NOBODY])] * 2
 HIDES = [np.repeat([0.1, 0.5], 40)] * 2
 """The door's motion suits the door, and puts the rack out of sight."""
 TREES = KDTree(BOTH[0]), KDTree(BOTH[1])
+SURFACE = Surface(BOTH[0], np.full((80, 3), 0.5), np.tile([0.0, 0, 1], (80, 1)), np.zeros(80), NO_SIGHT)
 
 
 def test_what_lies_apart_and_meets_nothing_is_foreign() -> None:
@@ -108,10 +109,7 @@ def test_further_territories_pay_or_are_left_to_others() -> None:
 
 def test_a_rack_is_not_the_doors() -> None:
     """Out of sight with the door it would cost half of what it does where it is; but it hangs far from the door."""
-    first, second = (
-        Surface(p, np.full(p.shape, 0.5), np.eye(3)[np.full(len(p), 2)], np.zeros(len(p)), NO_SIGHT) for p in BOTH
-    )
-    problem = Labelling.of((first, second), 1.0)
+    problem = Labelling.of((SURFACE, SURFACE), 1.0)
     costs, partners = joined(STAY, HIDES), joined([NOBODY.repeat(2)] * 2, MEETS)
     number = problem.territories(costs, partners)
     free, settled = problem.mean_field(costs, partners)[0], problem.settled(costs, partners, number)
@@ -129,8 +127,5 @@ def test_a_rack_is_not_the_doors() -> None:
 
 
 def test_where_points_are_denser_each_neighbour_says_less() -> None:
-    first, second = (
-        Surface(p, np.full(p.shape, 0.5), np.eye(3)[np.full(len(p), 2)], np.zeros(len(p)), NO_SIGHT) for p in BOTH
-    )
-    thinned, dense = (Labelling.of((first, second), 1.0, density) for density in (1, 4))
+    thinned, dense = (Labelling.of((SURFACE, SURFACE), 1.0, density) for density in (1, 4))
     assert dense.smoothness == thinned.smoothness / 2

@@ -98,16 +98,21 @@ def align(
     there, here = errors_by_part(in_others, trials, judges), errors_by_part(in_first, back, [(), judges[0]])
     was, now = _mean(np.concatenate([there, here], 1))
     found = poses.T_state_0()
-    shares = [torch.bincount(g.part, minlength=parts)[1:].cpu().numpy() for g in (first, second)]
-    slit = np.minimum(*shares) < SLIT * np.maximum(*shares)
-    far = np.zeros(parts - 1, bool)
-    for k in np.flatnonzero(slit) + 1:
-        more = first if shares[0][k - 1] > shares[1][k - 1] else second
-        ways = found[other, k], T_state_0[other, k]
-        here = ways if more is first else [np.linalg.inv(T) for T in ways]
-        far[k - 1] = apart(more.means[more.part == k].cpu().numpy(), *here) > JUMP * extent
+    far = _strayed((first, second), found[other], T_state_0[other], extent)
     better = np.concatenate([[False], free & (now < was) & ~far])
     return np.where(better[:, None, None], found, T_state_0)
+
+
+def _strayed(states: tuple[Gaussians, Gaussians], found: np.ndarray, start: np.ndarray, extent: float) -> np.ndarray:
+    """(movers,) bool: those that one state hardly shows, and whose pose (parts, 4, 4) is far from where it started."""
+    shares = [torch.bincount(g.part, minlength=len(found))[1:].cpu().numpy() for g in states]
+    slit = np.minimum(*shares) < SLIT * np.maximum(*shares)
+    far = np.zeros(len(slit), bool)
+    for k in np.flatnonzero(slit) + 1:
+        s = int(shares[0][k - 1] <= shares[1][k - 1])
+        ways = (T[k] if s == 0 else np.linalg.inv(T[k]) for T in (found, start))
+        far[k - 1] = apart(states[s].means[states[s].part == k].cpu().numpy(), *ways) > JUMP * extent
+    return far
 
 
 def _inverse(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:

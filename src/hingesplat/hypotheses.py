@@ -286,7 +286,8 @@ def candidates(evidence: Evidence, seeds: Sequence[np.ndarray], judges: Pair) ->
     for near, steps in CLIMB:
         higher = [_one_round(e, motion, judges, near, steps) for motion in climbing]
         climbing = promising(higher, APART, round(GO_ON * len(higher)))
-    higher += [squared(e, m, _both_concerned(e, m, judges, CLIMB[-1][0])) for m in higher]
+    slides = [m for m in higher if m.kind == "prismatic"]
+    higher += [squared(e, m, _both_concerned(e, m, judges, CLIMB[-1][0])) for m in slides]
     found = promising([*higher, *pool], APART, 2 * e.config.candidates)
     possible = [m for m, odd in zip(found, oddities(e, found, judges), strict=True) if odd < IMPOSSIBLE]
     return possible[: e.config.candidates]

@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 from hingesplat.mean_field import mean_field
 from hingesplat.se3 import moved
 from hingesplat.surface import Labels, Surface, free_share
-from hingesplat.territory import FOREIGN, barred, further, links, territories
+from hingesplat.territory import FOREIGN, barred, further, lead, links, territories
 from hingesplat.visibility import COLOUR, SURFACE, Sight, ask
 
 ARRIVED = 4
@@ -403,8 +403,7 @@ class Choices:
         better = dict.fromkeys(kept, 0.0)
         for cost, label in zip(costs, labels, strict=True):
             for i, k in enumerate(sorted(kept), 1):
-                own = cost[label == i]
-                better[k] += float((np.delete(own, i, axis=1).min(1) - own[:, i]).sum())
+                better[k] += float(lead(cost[label == i], i).sum())
         return better
 
     def stand_ins(self, kept: Collection[int], k: int) -> tuple[np.ndarray, np.ndarray]:

@@ -85,6 +85,11 @@ def barred(costs: Sequence[np.ndarray], foreign: Sequence[np.ndarray]) -> list[n
     return [np.where(f, c + BARRED, c).astype(np.float32) for c, f in zip(costs, foreign, strict=True)]
 
 
+def lead(costs: np.ndarray, label: int) -> np.ndarray:
+    """(n,) by how much a label costs points less than the next best, costs being (n, labels)."""
+    return np.delete(costs, label, axis=1).min(1) - costs[:, label]
+
+
 def further(
     costs: Sequence[np.ndarray], number: Sequence[np.ndarray], labels: Labels, price: float
 ) -> tuple[int, list[np.ndarray]]:
@@ -101,8 +106,7 @@ def further(
         gains, held = np.zeros(size), np.zeros(size, int)
         for cost, mine, label in zip(costs, number, labels, strict=True):
             own = np.flatnonzero((label == k) & (mine[:, k] > 0))
-            gain = np.delete(cost[own], k, axis=1).min(1) - cost[own, k]
-            gains += np.bincount(mine[own, k], np.maximum(gain, 0), size)
+            gains += np.bincount(mine[own, k], np.maximum(lead(cost[own], k), 0), size)
             held += np.bincount(mine[own, k], minlength=size)
         # Of two motions that are the same neither gains anything: then it is the one that holds most.
         others = (held > FEW) & (np.arange(size) != (gains + 1e-6 * held).argmax())
@@ -113,4 +117,4 @@ def further(
     return worthy, away
 
 
-__all__ = ["barred", "further", "links", "territories"]
+__all__ = ["barred", "further", "lead", "links", "territories"]
